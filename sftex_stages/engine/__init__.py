@@ -1,0 +1,1 @@
+"""The engine: keys, plan, store, execution. It knows stages only through their record, `engine.stage.Stage`."""
