@@ -86,7 +86,7 @@ def load_image(
 
 
 def load_mask(path: Path, max_megapixels: float = 50.0) -> np.ndarray:
-    """Load a mask, (H, W) bool: True where it is opaque and brighter than half its maximum (0/1 and 0/255 both work)."""
+    """Load a mask, (H, W) bool: True where opaque and brighter than half its maximum (0/1 and 0/255 both work)."""
     rgb, opaque = load_image(path, max_megapixels, "linear")  # the threshold is meant for values as they are stored
     grey = rgb.mean(axis=2) * opaque
     if not (grey > 0).any():
@@ -262,7 +262,7 @@ def _expand(item: str) -> list[Path]:
             raise InputError(f"{path}: this is a mask (its name ends in .mask.png); name the image that it belongs to")
         return [path]
     if path.is_dir():
-        files = _photographs(path.iterdir())
+        files = _photographs(_listing(path))
         if not files:
             raise InputError(f"{path}: no image in this folder (masks, hidden files and subfolders do not count)")
         return files
@@ -284,6 +284,13 @@ def _photographs(paths: Iterable[Path]) -> list[Path]:
     return readable + [p for p in files if p.suffix[1:].lower() in _UNDECODABLE and p.with_suffix("") not in twins]
 
 
+def _listing(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError as e:
+        raise InputError(f"{folder}: the folder cannot be read ({e.strerror or e}); check its permissions") from e
+
+
 def _is_mask(path: Path) -> bool:
     return path.name.lower().endswith(".mask.png")
 
@@ -292,13 +299,11 @@ def _mask_of(image: Path, masks: Path | None, listings: dict[Path, dict[str, Pat
     """The image's mask; names compare without case, one that matches with its case goes first."""
     folder = masks if masks is not None else image.parent
     if folder not in listings:
-        listings[folder] = {p.name: p for p in sorted(folder.iterdir()) if p.suffix.lower() == ".png"}
+        files = [p for p in _listing(folder) if p.suffix.lower() == ".png"]
+        listings[folder] = {p.name.lower(): p for p in files} | {p.name: p for p in files}
     here = listings[folder]
-    lower: dict[str, Path] = {}
-    for name, path in here.items():
-        lower.setdefault(name.lower(), path)
     for name in [f"{image.stem}.mask.png"] + ([f"{image.stem}.png"] if masks is not None else []):
-        mask = here.get(name) or lower.get(name.lower())
+        mask = here.get(name) or here.get(name.lower())
         if mask is not None and not mask.samefile(image):
             return mask
     return None

@@ -202,9 +202,10 @@ def test_stray_bytes_between_jpeg_segments_do_no_harm(tmp_path: Path) -> None:
 
 
 def test_size_limit_holds_before_pixels_are_read(tmp_path: Path) -> None:
-    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 30000, 30000, 8, 2, 0, 0, 0))
-    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", zlib.compress(b"\0" * 99)))
-    with pytest.raises(InputError, match=r"30000 × 30000 = 900\.0 megapixels.*image\.max_megapixels"):
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 9000, 9000, 1, 0, 0, 0, 0))  # one bit a pixel: 10 kB
+    body = png_chunk(b"IDAT", zlib.compress(bytes(9000 * 1126))) + png_chunk(b"IEND", b"")
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + body)
+    with pytest.raises(InputError, match=r"9000 × 9000 = 81\.0 megapixels.*image\.max_megapixels"):
         load_image(tmp_path / "bomb.png")
     write(tmp_path / "a.png", PIXELS[..., :3])
     with pytest.raises(InputError, match="over the limit"):
