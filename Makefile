@@ -31,8 +31,8 @@ $(STAMP): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "sftex needs Python 3.11 or newer; make PYTHON=/path/to/python3.11 if it is not on the PATH" >&2; exit 1; }
 	@echo "setting up $(VENV) with $(PYTHON) (first use, or the dependencies changed) ..." >&2
 	@"$(PYTHON)" -m venv --clear $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
 reconstruct: $(STAMP)
