@@ -1,0 +1,218 @@
+"""The artefact store: immutable files named by their key, each with a readable receipt written last.
+
+::
+
+    <root>/<stage>/<key[:2]>/<key>.h5     the arrays (HDF5)
+    <root>/<stage>/<key[:2]>/<key>.json   the receipt: inputs, parameters, versions, duration, SHA-256 of the artefact
+    <root>/<stage>/<key[:2]>/<key>.log    traceback of a failed attempt, until one succeeds
+    <root>/crashes.log                    where processes died, if they could still tell
+    <root>/damaged/                       what failed its checksum, set aside
+    <root>/tmp/                           files being written
+
+Every file is written under a temporary name, synced and renamed, so it is there whole or not at all; no receipt means
+not done. There is no other state: nothing to get stuck, nothing to lock. Nothing is trusted that was not hashed: the
+receipt carries its own checksum, the artefact's SHA-256 is compared at every read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import StoreError
+from . import keys
+
+Receipt = dict[str, Any]
+_STALE_TEMPORARY = 24 * 3600  # seconds; younger ones may belong to another run
+
+
+class DamagedError(Exception):
+    """An artefact that was verified a moment ago is not what its receipt says. Mended by computing it again."""
+
+    def __init__(self, stage: str, key: str, problem: str) -> None:
+        super().__init__(stage, key, problem)
+        self.stage, self.key, self.problem = stage, key, problem
+
+
+@dataclass
+class Store:
+    """A folder of artefacts. Cheap to create; keeps what it has verified for its own lifetime (one run)."""
+
+    root: Path
+    notices: list[str] = field(default_factory=list)  # what was set aside, in words
+    _verified: dict[tuple[str, str], Receipt] = field(default_factory=dict)
+
+    def path(self, stage: str, key: str, suffix: str = ".h5") -> Path:
+        """Where a file of the job `key` of `stage` lives."""
+        return self.root / stage / key[:2] / (key + suffix)
+
+    def prepare(self) -> None:
+        """Create the store and prove that it can be written; StoreError (with what to do) otherwise."""
+        try:
+            (self.root / "tmp").mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.root / "tmp") as probe:
+                probe.write(b"probe")
+                probe.flush()
+                os.fsync(probe.fileno())
+            for left_over in (self.root / "tmp").iterdir():  # of runs that were killed
+                if time.time() - left_over.stat().st_mtime > _STALE_TEMPORARY:
+                    left_over.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(
+                f"{self.root.parent}: cannot be written ({error.strerror}); choose another output folder with --out"
+            ) from error
+
+    def find(self, stage: str, key: str, repair: bool = True) -> tuple[Receipt | None, str]:
+        """The verified receipt of a finished job, or None and the reason in words ("" if it simply was never done).
+
+        Damaged files are set aside (unless not `repair`), so that the job can be done again.
+        """
+        if (stage, key) in self._verified:
+            return self._verified[stage, key], ""
+        try:
+            receipt = read_receipt(self.path(stage, key, ".json"))
+        except FileNotFoundError:
+            return None, ""
+        except (OSError, ValueError) as error:
+            return None, self._damaged(stage, key, f"damaged receipt ({error})", repair)
+        try:
+            self._check_artefact(stage, key, receipt)
+        except FileNotFoundError:
+            return None, "artefact removed"
+        except (OSError, ValueError) as error:
+            return None, self._damaged(stage, key, f"damaged artefact ({error})", repair)
+        self._verified[stage, key] = receipt
+        if repair:
+            self._used(stage, key)
+        return receipt, ""
+
+    def _used(self, stage: str, key: str) -> None:
+        """Leave a trace of use in the receipt's file time: tells `history` what the last run used, nothing else."""
+        try:
+            os.utime(self.path(stage, key, ".json"))
+        except OSError:  # a store that may only be read
+            pass
+
+    def _check_artefact(self, stage: str, key: str, receipt: Receipt) -> None:
+        expected = receipt["artefact"]
+        if expected is None:  # a job that left files elsewhere (a delivery)
+            return
+        with open(self.path(stage, key), "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size != expected["bytes"]:
+                raise ValueError(f"{size} bytes instead of {expected['bytes']}")
+            if hashlib.file_digest(file, "sha256").hexdigest() != expected["sha256"]:
+                raise ValueError("wrong SHA-256")
+
+    def read_artefact(self, stage: str, key: str, sha256: str) -> bytes:
+        """The artefact's bytes, verified. DamagedError if they are not those of the receipt."""
+        try:
+            image = self.path(stage, key).read_bytes()  # hashed and decoded from one read: no change in between
+        except OSError as error:
+            raise DamagedError(stage, key, f"cannot be read ({error.strerror})") from error
+        if hashlib.sha256(image).hexdigest() != sha256:
+            raise DamagedError(stage, key, "wrong SHA-256")
+        return image
+
+    def publish(self, stage: str, key: str, image: bytes | None, receipt: Receipt) -> Receipt:
+        """Write artefact, then receipt (with the artefact's hash and a checksum of its own); StoreError if impossible."""
+        artefact = None
+        if image is not None:
+            artefact = {"sha256": hashlib.sha256(image).hexdigest(), "bytes": len(image)}
+        receipt = {**receipt, "artefact": artefact}
+        receipt["checksum"] = keys.digest(receipt)
+        if image is not None:
+            self._write(self.path(stage, key), image)
+        self._write(self.path(stage, key, ".json"), json.dumps(receipt, indent=1, ensure_ascii=False).encode())
+        self.path(stage, key, ".log").unlink(missing_ok=True)
+        return receipt
+
+    def write_log(self, stage: str, key: str, text: str) -> Path:
+        """Keep the traceback of a failed job beside its receipt."""
+        path = self.path(stage, key, ".log")
+        self._write(path, text.encode())
+        return path
+
+    def accept(self, stage: str, key: str, receipt: Receipt) -> None:
+        """A worker has just published this: no need to hash it again in this run."""
+        self._verified[stage, key] = receipt
+
+    def reject(self, damage: DamagedError) -> None:
+        """Set aside what a worker found damaged."""
+        self._damaged(damage.stage, damage.key, f"damaged artefact ({damage.problem})", repair=True)
+
+    def history(self, stage: str) -> dict[tuple[str, int | None], Receipt]:
+        """The most recently used receipt of every (image label, part): only for explaining, never for keys."""
+        latest: dict[tuple[str, int | None], tuple[int, Receipt]] = {}
+        for path in self._receipts(stage):
+            try:
+                receipt, used = read_receipt(path), path.stat().st_mtime_ns
+            except (OSError, ValueError):
+                continue
+            label = receipt["label"], receipt["identity"]["part"]
+            if label not in latest or latest[label][0] < used:
+                latest[label] = used, receipt
+        return {label: receipt for label, (_, receipt) in latest.items()}
+
+    def _receipts(self, stage: str) -> Iterator[Path]:
+        return (self.root / stage).glob("??/*.json")
+
+    def _damaged(self, stage: str, key: str, problem: str, repair: bool) -> str:
+        self._verified.pop((stage, key), None)
+        if not repair:
+            return problem
+        folder = self.root / "damaged"
+        try:
+            folder.mkdir(exist_ok=True)
+            for suffix in (".h5", ".json"):
+                path = self.path(stage, key, suffix)
+                if path.exists():
+                    os.replace(path, folder / f"{stage}-{key[:16]}-{time.time_ns()}{suffix}")
+        except OSError as error:
+            raise StoreError(f"{folder}: a damaged artefact cannot be set aside ({error.strerror})") from error
+        self.notices.append(f"{stage} {key[:12]}: {problem}; set aside in {folder}, computed again")
+        return problem
+
+    def _write(self, path: Path, content: bytes) -> None:
+        try:
+            write_atomically(path, content, self.root / "tmp")
+        except OSError as error:
+            raise StoreError(
+                f"{path}: cannot be written ({error.strerror}); free space or choose another --out"
+            ) from error
+
+
+def write_atomically(path: Path, content: bytes, scratch: Path) -> None:
+    """Write under a temporary name in `scratch` (same file system), sync, rename: whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch.mkdir(parents=True, exist_ok=True)
+    temporary = scratch / uuid.uuid4().hex
+    try:
+        with open(temporary, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_receipt(path: Path) -> Receipt:
+    """A receipt whose checksum is right; ValueError (in words) otherwise, OSError if it cannot be read."""
+    try:
+        receipt = json.loads(path.read_bytes())
+        checksum = receipt.pop("checksum")
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise ValueError("not a receipt") from error
+    if keys.digest(receipt) != checksum:
+        raise ValueError("wrong checksum")
+    return {**receipt, "checksum": checksum}
