@@ -1,0 +1,254 @@
+"""The archive result.h5: everything that was recovered from one photograph, readable years later with h5py alone.
+
+`SCHEMA` is its definition: the writer, the reader's checks and the attributes in the file all come from that table.
+Frame: x right, y down, z toward the camera, pixel centres at integers; light is linear.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from ..engine.stage import Arrays
+from ..errors import InputError
+
+SCHEMA_NAME = "sftex-result"
+SCHEMA_VERSION = 1
+AXES = "x right, y down, z toward the camera; pixel centres at integers"
+
+
+class Entry(NamedTuple):
+    """One dataset: dtype ("U" = UTF-8 text), axes by letter (H, W image; N instances; K textons; n grid), unit, meaning."""
+
+    dtype: str
+    axes: str
+    unit: str
+    about: str
+
+
+SCHEMA = {
+    "surface/height": Entry("f4", "H W", "px", "height toward the camera, NaN where unsupported"),
+    "surface/normals": Entry("f4", "H W 3", "1", "unit normal, n ∝ (-dz/dx, -dz/dy, 1), NaN where unsupported"),
+    "surface/valid": Entry("?", "H W", "1", "True where measurements support the surface"),
+    "surface/normal_sigma": Entry("f4", "H W", "degree", "expected error of the normal"),
+    "irradiance/map": Entry("f4", "H W", "relative", "linear irradiance, geometric mean 1 over valid, else NaN"),
+    "instances/xy": Entry("f4", "N 2", "px", "centre in the image"),
+    "instances/transform": Entry("f4", "N 2 2", "1", "maps frontal px to image px"),
+    "instances/normal": Entry("f4", "N 3", "1", "unit normal with its sign resolved"),
+    "instances/inlier": Entry("f4", "N", "1", "posterior of being a view of its texton"),
+    "instances/state": Entry("f4", "N 3", "1", "posteriors of: sign +, sign -, not from the surface"),
+    "instances/irradiance": Entry("f4", "N", "relative", "irradiance, on one scale for all textons"),
+    "instances/irradiance_sigma": Entry("f4", "N", "1", "standard deviation of its logarithm"),
+    "instances/texton": Entry("i4", "N", "1", "row in textons/*"),
+    "instances/normal_sigma": Entry("f4", "N", "degree", "expected error of the normal"),
+    "textons/appearance": Entry(
+        "f4", "K n n 3", "relative", "frontal albedo, linear; centred, NaN beyond its own grid"
+    ),
+    "textons/domain": Entry("f4", "K n n", "1", "weight of the texton's pixels, 0 to 1; 0 beyond its own grid"),
+    "textons/spacing": Entry("f4", "K", "px", "frontal px per grid px"),
+    "textons/usable": Entry("?", "K", "1", "whether its instances entered the surface"),
+    "textons/reason": Entry("U", "K", "1", "why not usable, in words; empty if usable"),
+    "textons/instances": Entry("i4", "K", "1", "number of its rows in instances/*"),
+    "textons/class_scale": Entry("f4", "K", "1", "r of its irradiance, NaN if unusable"),
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a result.h5 holds, as arrays in memory; `SCHEMA` gives axes, units and meaning of each.
+
+    H × W pixels, N instances, K textons. `instances` and `textons` are keyed by the names after the slash.
+    `focal_px` and `principal_point` (x, y) are None under an orthographic camera. `attributes` has everything else:
+    image_name, image_sha256, config_yaml, keys and versions (these two as dictionaries), schema, schema_version, axes.
+    """
+
+    path: Path
+    height: np.ndarray  # (H, W) px
+    normals: np.ndarray  # (H, W, 3)
+    valid: np.ndarray  # (H, W) bool
+    normal_sigma: np.ndarray  # (H, W) degrees
+    irradiance: np.ndarray  # (H, W) relative
+    instances: Mapping[str, np.ndarray]
+    textons: Mapping[str, np.ndarray]
+    camera: str = "orthographic"
+    focal_px: float | None = None
+    principal_point: tuple[float, float] | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+
+# ---------------------------------------------------------------------------------------------------- writing
+
+
+def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any]) -> bytes:
+    """The archive's bytes, from the stages' arrays {"frontal": [...], "surface": …, "irradiance": …} and `meta`.
+
+    meta: image_name, image_sha256, config_yaml (texts), keys, versions (dictionaries). Equal input gives equal bytes.
+    Built in memory, so that a full disk is an ordinary OSError at the write instead of a crash inside of HDF5.
+    """
+    with h5py.File.in_memory(libver=("v110", "v110")) as file:
+        file.attrs["schema"] = SCHEMA_NAME
+        file.attrs["schema_version"] = SCHEMA_VERSION
+        file.attrs["about"] = (
+            "surface, normals and relative irradiance recovered from texture in one photograph (sftex)"
+        )
+        file.attrs["axes"] = AXES
+        file.attrs["camera"] = "orthographic"
+        for name in ("image_name", "image_sha256", "config_yaml"):
+            file.attrs[name] = str(meta[name])
+        for name in ("keys", "versions"):
+            file.attrs[name] = json.dumps(meta[name], sort_keys=True)
+        for name, array in _collect(arrays).items():
+            entry = SCHEMA[name]
+            dataset = _create(file, name, array, entry.dtype)
+            dataset.attrs["axes"] = entry.axes
+            dataset.attrs["unit"] = entry.unit
+            dataset.attrs["about"] = entry.about
+        file.flush()
+        image: bytes = file.id.get_file_image()
+    return image
+
+
+def _collect(arrays: Mapping[str, Any]) -> Arrays:
+    """The schema's datasets from the stages' arrays."""
+    surface, irradiance, frontal = arrays["surface"], arrays["irradiance"], arrays["frontal"]
+    data: Arrays = {f"surface/{n}": surface[n] for n in ("height", "normals", "valid", "normal_sigma")}
+    data["irradiance/map"] = irradiance["map"]
+    for name in SCHEMA:
+        group, _, short = name.partition("/")
+        if group == "instances":
+            data[name] = surface[f"instance/{short}"]
+    data["instances/irradiance"] = irradiance["instance/irradiance"]
+    data |= {f"textons/{n}": a for n, a in _stack(frontal).items()}
+    data["textons/instances"] = np.bincount(surface["instance/texton"], minlength=len(frontal))
+    data["textons/class_scale"] = irradiance["class_scale"]
+    return data
+
+
+def _stack(frontal: list[Arrays]) -> Arrays:
+    """Textons of different grids in common arrays, their centres aligned."""
+    n = max((len(t["domain"]) for t in frontal), default=0)
+    appearance = np.full((len(frontal), n, n, 3), np.nan, np.float32)
+    domain = np.zeros((len(frontal), n, n), np.float32)
+    for k, texton in enumerate(frontal):
+        m = len(texton["domain"])
+        a = (n - m) // 2
+        domain[k, a : a + m, a : a + m] = texton["domain"]
+        appearance[k, a : a + m, a : a + m] = texton["appearance"]
+    return {
+        "appearance": appearance,
+        "domain": domain,
+        "spacing": np.array([t["spacing"] for t in frontal], np.float32),
+        "usable": np.array([t["usable"] for t in frontal], bool),
+        "reason": np.array([str(t["reason"]) for t in frontal], np.str_),
+    }
+
+
+def _create(file: h5py.File, name: str, array: np.ndarray, dtype: str) -> h5py.Dataset:
+    if dtype == "U":  # fixed length: variable-length strings lie outside of the checksums
+        text = np.char.encode(np.asarray(array, np.str_), "utf-8")
+        length = max(1, text.dtype.itemsize)
+        return file.create_dataset(name, data=text.astype(f"S{length}"), dtype=h5py.string_dtype("utf-8", length))
+    array = np.ascontiguousarray(array, dtype)
+    if array.nbytes < 4096:
+        return file.create_dataset(name, data=array)
+    rows = max(1, min(len(array), 2**20 * len(array) // array.nbytes))
+    return file.create_dataset(
+        name, data=array, chunks=(rows, *array.shape[1:]), compression=1, shuffle=True, fletcher32=True
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- reading
+
+
+def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
+    """Read a result.h5 completely.
+
+    Nothing but plain datasets inside of this one file is read: links, external storage and virtual datasets are refused,
+    and so is, before any is read, data of more than `max_bytes`. Raises InputError.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the result.h5 in an output folder")
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            attributes = {str(name): value for name, value in file.attrs.items()}
+            _check_schema(path, attributes)
+            datasets = {name: _dataset(path, file, name) for name in SCHEMA}
+            _check_shapes(path, datasets, max_bytes)
+            data = {n: _text(d) if SCHEMA[n].dtype == "U" else d[()] for n, d in datasets.items()}
+            for name in ("keys", "versions"):
+                attributes[name] = json.loads(attributes[name])
+            camera = str(attributes.pop("camera"))
+            focal = float(attributes.pop("focal_px")) if camera == "perspective" else None
+            centre = tuple(map(float, attributes.pop("principal_point"))) if camera == "perspective" else None
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as e:
+        raise InputError(f"{path}: not a whole sftex result ({e}); run sftex again to make it anew") from e
+    return Result(
+        path=path,
+        **{n: data[f"surface/{n}"] for n in ("height", "normals", "valid", "normal_sigma")},
+        irradiance=data["irradiance/map"],
+        instances={n.partition("/")[2]: a for n, a in data.items() if n.startswith("instances/")},
+        textons={n.partition("/")[2]: a for n, a in data.items() if n.startswith("textons/")},
+        camera=camera,
+        focal_px=focal,
+        principal_point=(centre[0], centre[1]) if centre else None,
+        attributes=attributes,
+    )
+
+
+def _check_schema(path: Path, attributes: Mapping[str, Any]) -> None:
+    if attributes.get("schema") != SCHEMA_NAME:
+        raise InputError(
+            f"{path}: an HDF5 file, but not a result of sftex (its attribute schema is not “{SCHEMA_NAME}”)"
+        )
+    if (version := int(attributes["schema_version"])) > SCHEMA_VERSION:
+        raise InputError(
+            f"{path}: written by a newer sftex (schema {version}, this one reads {SCHEMA_VERSION}); update it"
+        )
+
+
+def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """The dataset `name`, which must lie in this file."""
+    node: Any = file
+    for part in name.split("/"):
+        link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+        if link is None:
+            raise InputError(f"{path}: {name} is missing; run sftex again to make the file anew")
+        if not isinstance(link, h5py.HardLink):
+            raise InputError(f"{path}: {name} is a link to elsewhere; such files are not read")
+        node = node[part]
+    if not isinstance(node, h5py.Dataset) or node.is_virtual or node.external:
+        raise InputError(f"{path}: {name} is not an ordinary dataset of this file; such files are not read")
+    return node
+
+
+def _check_shapes(path: Path, datasets: Mapping[str, h5py.Dataset], max_bytes: int) -> None:
+    total, sizes = 0, {}
+    for name, dataset in datasets.items():
+        entry = SCHEMA[name]
+        axes = entry.axes.split()
+        kinds = "SO" if entry.dtype == "U" else {"f4": "f", "i4": "iu", "?": "b"}[entry.dtype]
+        if dataset.dtype.kind not in kinds or len(dataset.shape or ()) != len(axes):
+            raise InputError(
+                f"{path}: {name} is {dataset.dtype} {dataset.shape}, expected {entry.dtype} ({entry.axes})"
+            )
+        for axis, size in zip(axes, dataset.shape, strict=True):
+            if sizes.setdefault(axis, int(axis) if axis.isdigit() else size) != size:
+                raise InputError(
+                    f"{path}: {name} is {dataset.shape}, but its axes are {entry.axes} with {axis} = {sizes[axis]}"
+                )
+        total += dataset.size * dataset.dtype.itemsize
+    if total > max_bytes:
+        raise InputError(
+            f"{path}: declares {total / 2**30:.1f} GiB of data, over the limit of {max_bytes / 2**30:.1f} GiB"
+        )
+
+
+def _text(dataset: h5py.Dataset) -> np.ndarray:
+    return np.asarray(dataset.asstr()[()], dtype=np.str_)
