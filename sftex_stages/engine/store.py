@@ -123,7 +123,7 @@ class Store:
         return image
 
     def publish(self, stage: str, key: str, image: bytes | None, receipt: Receipt) -> Receipt:
-        """Write artefact, then receipt (with the artefact's hash and a checksum of its own); StoreError if impossible."""
+        """Write artefact, then receipt (with the artefact's hash and its own checksum). StoreError if impossible."""
         artefact = None
         if image is not None:
             artefact = {"sha256": hashlib.sha256(image).hexdigest(), "bytes": len(image)}

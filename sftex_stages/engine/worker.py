@@ -14,6 +14,7 @@ import traceback
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -28,7 +29,7 @@ from .store import DamagedError, Receipt, Store
 
 _CACHE_BYTES = 512 << 20
 _cache: OrderedDict[str, Arrays] = OrderedDict()  # content hash -> arrays: the jobs of an image share its artefacts
-_LIBRARIES = ("numpy", "scipy", "h5py", "cv2", "sklearn", "OpenImageIO", "joblib", "pydantic")
+_LIBRARIES = ("numpy", "scipy", "h5py", "scikit-learn", "OpenImageIO", "joblib", "pydantic")
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def describe(arrays: Arrays) -> dict[str, Any]:
     shapes, scalars = {}, {}
     for name, value in sorted(arrays.items()):
         array = np.asarray(value)
-        shapes[name] = f"{'text' if array.dtype.kind == 'U' else array.dtype} {list(array.shape)}"
+        shapes[name] = {"dtype": "text" if array.dtype.kind == "U" else str(array.dtype), "shape": list(array.shape)}
         if array.ndim == 0:
             scalar = array.item()
             scalars[name] = None if isinstance(scalar, float) and not np.isfinite(scalar) else scalar
@@ -166,14 +167,18 @@ def _unexpected(store: Store, job: Job, error: Exception) -> Outcome:
     return Outcome(job, error=f"{summary}; see {log}", log=log)
 
 
+@lru_cache
 def _software() -> dict[str, str]:
-    """Versions of what this process has loaded."""
+    """Versions of sftex and of what it computes with."""
     versions = {"python": platform.python_version()}
-    package = sys.modules[__name__.partition(".")[0]]
-    versions["sftex"] = str(getattr(package, "__version__", "unknown"))
+    versions["sftex"] = str(getattr(sys.modules[__name__.partition(".")[0]], "__version__", "unknown"))
     for name in _LIBRARIES:
-        if name in sys.modules:
-            versions[name] = str(getattr(sys.modules[name], "__version__", "unknown"))
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    if "cv2" in sys.modules:  # its distribution has several names
+        versions["opencv"] = sys.modules["cv2"].__version__
     return versions
 
 
