@@ -54,7 +54,12 @@ class _File:
 
     def array(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
         """Dataset `name` of this shape (None: any length), checked before it is read."""
-        node = self.file.get(name)
+        node: Any = self.file
+        for part in name.split("/"):
+            link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+            node = node[part] if isinstance(link, h5py.HardLink) else None
+        if isinstance(node, h5py.Dataset) and (node.is_virtual or node.external):
+            raise InputError(f"{self.path}: {name} takes its numbers from another file; such files are not read")
         if not isinstance(node, h5py.Dataset):
             raise InputError(f"{self.path}: dataset {name} is missing; is this a {self.what} file of sftex?")
         same = len(node.shape) == len(shape)
@@ -83,9 +88,9 @@ class _File:
 def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path | str | None = None) -> dict[str, Any]:
     """Every figure of accuracy of a result, as nested dicts of numbers, None where a figure does not exist.
 
-    result_path: a `result.h5`; truth_path: see the module. image_path: the photograph; with it the irradiance baseline
-    of a blurred image is reported too. Angles in degrees, shares 0…1. Raises InputError if a file cannot be used or the
-    two do not belong together. `measures` defines each figure.
+    result_path: a `result.h5` or its folder; truth_path: see the module. image_path: the photograph; with it the
+    irradiance baseline of a blurred image is reported too. Angles in degrees, shares 0…1. Raises InputError if a file
+    cannot be used or the two do not belong together. `measures` defines each figure.
     """
     with _File(Path(truth_path), "truth") as truth:
         size = truth.array("surface/valid", (None, None)).shape
@@ -97,7 +102,10 @@ def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path |
         light = truth.array("irradiance/map", size).astype(float) if truth.has("irradiance/map") else None
         elements = _true_instances(truth) if truth.has("instances") else None
         true_camera = truth.camera()
-    with _File(Path(result_path), "result") as result:
+    result_path = Path(result_path)
+    if result_path.is_dir():
+        result_path /= "result.h5"
+    with _File(result_path, "result") as result:
         own = result.array("surface/valid", (None, None)).shape
         if own != size:
             raise InputError(
