@@ -208,28 +208,6 @@ def _decode(v: np.ndarray, power: float) -> np.ndarray:
     return np.asarray(np.copysign(linear, v), np.float32)
 
 
-def to_display(light: np.ndarray, exposure: float | None = None) -> np.ndarray:
-    """Linear light, float32 of any shape, times `exposure`, to sRGB uint8, for pictures.
-
-    Without `exposure` it is 1, unless the scene is far from the range 0…1, as EXR may be: then the 99th percentile is
-    taken to 0.9.
-    """
-    if exposure is None:
-        bright = float(np.percentile(light[:: max(1, len(light) // 256)], 99)) if light.size else 1.0
-        exposure = 1.0 if 0.05 < bright <= 1 else 0.9 / max(bright, 1e-12)
-    v = np.clip(light * np.float32(exposure), 0, 1)
-    # A table over 16 bits of linear light is finer than 8 bits of sRGB need anywhere but in the darkest two steps.
-    return _ENCODE[(v * 65535 + 0.5).astype(np.uint16)]
-
-
-def _encode_table() -> np.ndarray:
-    v = np.arange(65536) / 65535
-    return (np.where(v <= 0.0031308, v * 12.92, 1.055 * v ** (1 / 2.4) - 0.055) * 255 + 0.5).astype(np.uint8)
-
-
-_ENCODE = _encode_table()
-
-
 def _what(head: bytes) -> str:
     if all(b >= 32 or b in b"\t\r\n\f" for b in head):
         return ": it holds text"

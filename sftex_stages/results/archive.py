@@ -24,7 +24,7 @@ AXES = "x right, y down, z toward the camera; pixel centres at integers"
 
 
 class Entry(NamedTuple):
-    """One dataset: dtype ("U" = UTF-8 text), axes by letter (H, W image; N instances; K textons; n grid), unit, meaning."""
+    """A dataset: dtype ("U" = UTF-8), axes by letter (H, W image; N instances; K textons; n grid), unit, meaning."""
 
     dtype: str
     axes: str
@@ -153,7 +153,7 @@ def _create(file: h5py.File, name: str, array: np.ndarray, dtype: str) -> h5py.D
     if dtype == "U":  # fixed length: variable-length strings lie outside of the checksums
         text = np.char.encode(np.asarray(array, np.str_), "utf-8")
         length = max(1, text.dtype.itemsize)
-        return file.create_dataset(name, data=text.astype(f"S{length}"), dtype=h5py.string_dtype("utf-8", length))
+        return file.create_dataset(name, data=text.astype(h5py.string_dtype("utf-8", length)))
     array = np.ascontiguousarray(array, dtype)
     if array.nbytes < 4096:
         return file.create_dataset(name, data=array)
@@ -169,8 +169,8 @@ def _create(file: h5py.File, name: str, array: np.ndarray, dtype: str) -> h5py.D
 def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
     """Read a result.h5 completely.
 
-    Nothing but plain datasets inside of this one file is read: links, external storage and virtual datasets are refused,
-    and so is, before any is read, data of more than `max_bytes`. Raises InputError.
+    Nothing but plain datasets inside of this one file is read: links, external storage and virtual datasets are
+    refused, and so is, before any is read, data of more than `max_bytes`. Raises InputError.
     """
     path = Path(path)
     if not path.is_file():
@@ -229,7 +229,8 @@ def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
 
 
 def _check_shapes(path: Path, datasets: Mapping[str, h5py.Dataset], max_bytes: int) -> None:
-    total, sizes = 0, {}
+    total = 0
+    sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         entry = SCHEMA[name]
         axes = entry.axes.split()

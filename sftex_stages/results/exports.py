@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 
-from ..errors import StoreError
+from ..errors import StageError, StoreError
 
 MAX_TRIANGLES = 190_000
 MAX_TEXTURE = 2048  # px, longer side; keeps a GLB under 10 MB
@@ -33,6 +33,28 @@ class Mesh(NamedTuple):
     normals: np.ndarray
     uv: np.ndarray
     faces: np.ndarray
+
+
+def to_display(light: np.ndarray, exposure: float | None = None) -> np.ndarray:
+    """Linear light, float32 of any shape, times `exposure`, to sRGB uint8, for pictures.
+
+    Without `exposure` it is 1, unless the scene is far from the range 0…1, as EXR may be: then the 99th percentile is
+    taken to 0.9.
+    """
+    if exposure is None:
+        bright = float(np.percentile(light[:: max(1, len(light) // 256)], 99)) if light.size else 1.0
+        exposure = 1.0 if 0.05 < bright <= 1 else 0.9 / max(bright, 1e-12)
+    v = np.clip(light * np.float32(exposure), 0, 1)
+    # A table over 16 bits of linear light is finer than 8 bits of sRGB need anywhere but in the darkest two steps.
+    return _ENCODE[(v * 65535 + 0.5).astype(np.uint16)]
+
+
+def _encode_table() -> np.ndarray:
+    v = np.arange(65536) / 65535
+    return (np.where(v <= 0.0031308, v * 12.92, 1.055 * v ** (1 / 2.4) - 0.055) * 255 + 0.5).astype(np.uint8)
+
+
+_ENCODE = _encode_table()
 
 
 def exr(data: np.ndarray, channels: tuple[str, ...], about: str, scratch: Path) -> bytes:
@@ -60,6 +82,7 @@ def mesh(height: np.ndarray, normals: np.ndarray, valid: np.ndarray, max_triangl
     """Triangulate a height field (H, W) on a regular grid coarse enough for `max_triangles`.
 
     A cell is filled only if every pixel that it covers is valid: holes stay open and separate pieces are not joined.
+    Raises StageError if no cell is.
     """
     h, w = height.shape
     valid = valid & np.isfinite(height) & np.isfinite(normals).all(axis=2)
@@ -76,14 +99,18 @@ def mesh(height: np.ndarray, normals: np.ndarray, valid: np.ndarray, max_triangl
     a = r * len(xs) + c  # top left; seen from the viewer, y up, counter-clockwise is down first
     b, below, d = a + 1, a + len(xs), a + len(xs) + 1
     faces = np.concatenate([np.stack([a, below, b], 1), np.stack([b, below, d], 1)])
-    used, faces = np.unique(faces, return_inverse=True)
+    if not len(faces):
+        raise StageError(f"the supported surface ({int(valid.sum())} pixels) is too small or too thin for a mesh")
+    here = np.zeros(len(ys) * len(xs), bool)
+    here[faces] = True
+    used, faces = np.flatnonzero(here), (np.cumsum(here) - 1)[faces]
     y, x = ys[used // len(xs)], xs[used % len(xs)]
     n = normals[y, x]
     return Mesh(
         np.stack([x, -y, height[y, x]], 1).astype(np.float32),
         (n * np.array([1, -1, 1])).astype(np.float32),
         np.stack([(x + 0.5) / w, (y + 0.5) / h], 1).astype(np.float32),
-        faces.reshape(-1, 3).astype(np.uint32),
+        faces.astype(np.uint32),
     )
 
 
@@ -96,7 +123,7 @@ def texture(photo: np.ndarray) -> bytes:
 
 
 def ply(surface: Mesh, photo: np.ndarray, texture_name: str) -> bytes:
-    """Binary PLY: position, normal, colour of the photograph (H, W, 3) uint8, texture coordinates into `texture_name`."""
+    """Binary PLY: position, normal, colour of the photograph (H, W, 3) uint8, coordinates into `texture_name`."""
     h, w = photo.shape[:2]
     x, y = surface.vertices[:, 0].astype(int), -surface.vertices[:, 1].astype(int)
     vertex = np.zeros(len(surface.vertices), [("p", "<f4", 3), ("n", "<f4", 3), ("rgb", "u1", 3), ("st", "<f4", 2)])

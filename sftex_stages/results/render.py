@@ -1,7 +1,7 @@
 """Oblique views of a height field: orthographic, hidden surfaces removed, anti-aliased, NumPy and OpenCV alone.
 
 Seen from any direction, height moves a point along one direction of the screen. Sampled along lines parallel to that
-direction, the surface falls apart into independent plane curves, each in one column of a sheared screen: a column has no
+direction, the surface falls apart into independent plane curves, each in one column of a sheared screen: there are no
 gaps sideways, and along it every segment of the curve is filled in whole. So the z-buffer is exact at its resolution
 and there is no loop over pixels. Colours are looked up afterwards, once for each pixel that is seen.
 """
@@ -15,8 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..images import to_display
-from .exports import STEEPEST
+from .exports import STEEPEST, to_display
 
 BACKGROUND = (244, 244, 246)
 SUPERSAMPLING = 2
@@ -42,9 +41,9 @@ def render(
     """Pictures of a height field from one direction, each (h, w, 3) uint8 RGB, the longer side `size` pixels.
 
     height (H, W) px, normals (H, W, 3) and valid (H, W) in the image's frame (x right, y down, z toward the camera).
-    One picture for each of `textures`: (H, W, 3) uint8 sRGB, or None: grey in a light from the upper left. The camera moves to the right
-    by `azimuth` and up by `elevation` degrees (|angles| < 80) from the photograph's own view. Where the back of the
-    surface shows, it is lit like its front, but darker.
+    One picture for each of `textures`: (H, W, 3) uint8 sRGB, or None: grey in a light from the upper left. The camera
+    moves to the right by `azimuth` and up by `elevation` degrees (|angles| < 80) from the photograph's own view. Where
+    the back of the surface shows, it is lit like its front, but darker.
     """
     view = _camera(azimuth, elevation)
     valid = valid & np.isfinite(height) & np.isfinite(normals).all(axis=2)
@@ -131,10 +130,10 @@ def _visible(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Hidden-surface removal. column (n, m): position along column j of curve point i, in samples, ≥ 1 where solid.
 
-    Returns winner (rows, m), the flat index of the point that begins the nearest segment, -1 where there is none, and the
-    fraction of the way to the next point.
+    Returns winner (rows, m), the flat index of the point that begins the nearest segment, -1 where there is none, and
+    the fraction of the way to the next point.
     """
-    n, m = column.shape
+    m = column.shape[1]
     first, last = column[:-1], column[1:]
     whole = solid[:-1] & solid[1:] & (np.abs(np.diff(z, axis=0)) <= STEEPEST * pitch)
     low = np.floor(np.minimum(first, last))
@@ -166,7 +165,7 @@ def _visible(
 
 
 def _shade(normals: np.ndarray, valid: np.ndarray, view: _View, px: np.ndarray, py: np.ndarray) -> np.ndarray:
-    """Grey of a matt surface in a distant light from the viewer's upper left and some light of the sky, (h, w, 3) uint8."""
+    """Grey of a matt surface lit from the viewer's upper left, from the viewer and from the sky, (h, w, 3) uint8."""
     field = np.where(valid[..., None], normals, 0).astype(np.float32)
     light = -0.62 * view.right - 0.55 * view.down + 0.75 * view.near
     light /= np.linalg.norm(light)
@@ -177,7 +176,9 @@ def _shade(normals: np.ndarray, valid: np.ndarray, view: _View, px: np.ndarray, 
     front = cosines[..., 2] >= 0
     sign = np.where(front, 1, -1) / np.maximum(length, np.float32(1e-6))
     diffuse = np.maximum(cosines[..., 0] * sign, 0)
-    linear = (0.08 + 0.72 * diffuse - 0.05 * cosines[..., 1] * sign) * np.where(front, 1, 0.45)
+    linear = (0.06 + 0.58 * diffuse + 0.16 * cosines[..., 2] * sign - 0.04 * cosines[..., 1] * sign) * np.where(
+        front, 1, 0.45
+    )
     return cv2.merge([to_display(linear.astype(np.float32), 1.0)] * 3)
 
 
@@ -201,8 +202,8 @@ def _develop(
     high: np.ndarray,
     pitch: float,
 ) -> np.ndarray:
-    """From the sheared screen (colour times coverage, coverage) to the picture: turn, average, lay on the background."""
-    w, h = (int(math.ceil(v / SUPERSAMPLING)) for v in (high - low) / pitch)
+    """From the sheared screen (colour × coverage, coverage) to the picture: turn, average, lay on the background."""
+    w, h = (math.ceil(v / SUPERSAMPLING) for v in (high - low) / pitch)
     # Sample (u, v) of the picture is the screen's point low + pitch (u, v); its place in `layers` follows.
     turn = np.stack([cross, along])
     shift = (turn @ low - origin) / pitch

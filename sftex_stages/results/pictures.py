@@ -1,0 +1,219 @@
+"""The PNGs that a person looks at first. Every function returns a picture, (h, w, 3) uint8 RGB."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from ..engine.stage import Arrays
+from .exports import to_display
+from .render import BACKGROUND
+
+INK = (40, 40, 46)
+FAINT = (120, 120, 128)
+WARNING = (170, 60, 30)
+_SUB = 4  # binary digits after the point of OpenCV's drawing coordinates
+
+
+def instances(photo: np.ndarray, surface: Arrays, size: int = 1600) -> np.ndarray:
+    """The instances as small circles lying on the surface, seen at their slant and tilt (the paper's Fig. 2, 11).
+
+    photo (H, W, 3) uint8; surface: the stage's `instance/*`. Each circle is the image T · (unit circle) of one common
+    radius, with a stroke along its normal; green: surely an instance and on the surface, red: surely not.
+    """
+    h, w = photo.shape[:2]
+    zoom = float(np.clip(size / max(h, w), 0.05, 4))
+    picture = cv2.resize(photo, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC)
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None]
+    picture = (0.25 * picture + 0.45 * grey + 50).astype(np.uint8)  # pale, so that the circles stand out
+    xy, transform, normal = surface["instance/xy"], surface["instance/transform"], surface["instance/normal"]
+    trust = surface["instance/inlier"] * (1 - surface["instance/state"][:, 2])
+    radius = _radius(xy, (h, w))
+    size_of_all = float(np.median(np.linalg.svd(transform, compute_uv=False)[:, 0])) if len(xy) else 1.0
+    angle = np.linspace(0, 2 * np.pi, 33)
+    circle = radius / size_of_all * np.stack([np.cos(angle), np.sin(angle)])
+    rings = _pixels(xy[:, None] + (transform @ circle).transpose(0, 2, 1), zoom)
+    strokes = _pixels(np.stack([xy, xy + 1.25 * radius * normal[:, :2]], 1), zoom)
+    # Twenty shades, drawn shade by shade, the sure ones last and so on top; a dark rim keeps them legible on any print.
+    shade = np.clip((trust * 20).astype(int), 0, 19)
+    width = 2 if radius * zoom > 7 else 1
+    for lines, closed in ((rings, True), (strokes, False)):
+        cv2.polylines(picture, list(lines), closed, (25, 25, 25), width + 2, cv2.LINE_AA, _SUB)
+    for k in np.unique(shade):
+        for lines, closed in ((rings, True), (strokes, False)):
+            cv2.polylines(
+                picture, list(lines[shade == k]), closed, _traffic_light((k + 0.5) / 20), width, cv2.LINE_AA, _SUB
+            )
+    used = len(np.unique(surface["instance/texton"]))
+    words = f"{len(xy)} instances of {used} textons, each as a circle on the surface with its normal"
+    return _legend(picture, words, [("sure", 1.0), ("doubtful", 0.5), ("rejected", 0.0)])
+
+
+def textons(frontal: Sequence[Arrays], counts: np.ndarray) -> np.ndarray:
+    """The frontal textons and how EM sharpened them (Fig. 4): a row each, columns after 1, 5, 10, 20 iterations.
+
+    counts (K,): instances that entered the surface. Usable textons first, the larger ones before; textons that never
+    got an appearance are summed up at the end, by their reason.
+    """
+    shown = [k for k, t in enumerate(frontal) if t["appearance"].size]
+    shown.sort(key=lambda k: (not frontal[k]["usable"], -int(counts[k]), -len(frontal[k]["xy"]), k))
+    tile, gap, words_width = 76, 6, 170
+    cell = np.array([4 * (tile + gap) + words_width + 24, tile + gap])
+    columns = int(np.clip(round(np.sqrt(len(shown) * cell[1] / cell[0] * 1.3)), 1, 5))
+    rows = -(-len(shown) // columns) if shown else 0
+    missing = _missing([t for t in frontal if not t["appearance"].size])
+    top, bottom = 64, 20 * len(missing) + (16 if missing else 0)
+    picture = np.full((top + rows * cell[1] + bottom + 10, max(columns * cell[0] + 16, 720), 3), BACKGROUND, np.uint8)
+    usable = sum(bool(t["usable"]) for t in frontal)
+    _write(picture, f"{len(frontal)} textons, {usable} usable, {int(np.sum(counts))} instances", (16, 28), 20, INK, 600)
+    for place, k in enumerate(shown):
+        x0, y0 = 16 + place // rows * cell[0], top + place % rows * cell[1]
+        if place % rows == 0:
+            for i, n in enumerate(frontal[k]["progress_iterations"]):
+                label = f"after {n}" if i == 0 else f"{n} iterations" if i == 3 else str(n)
+                _write(picture, label, (x0 + i * (tile + gap), top - 8), 13, FAINT)
+        for i, view in enumerate(_tiles(frontal[k], tile)):
+            x = x0 + i * (tile + gap)
+            picture[y0 : y0 + tile, x : x + tile] = view
+        _caption(picture, frontal[k], k, int(counts[k]), (x0 + 4 * (tile + gap) + 4, y0 + 15))
+    for i, line in enumerate(missing):
+        _write(picture, line, (16, top + rows * cell[1] + 22 + 20 * i), 14, FAINT)
+    return picture
+
+
+def normal_map(normals: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Normals in the usual colours: red to the right, green up, blue toward the viewer; 128 is 0."""
+    n = np.where(valid[..., None], normals, 0) * np.array([1, -1, 1], np.float32)
+    picture = ((n * 0.5 + 0.5) * 255 + 0.5).astype(np.uint8)
+    picture[~valid] = BACKGROUND
+    return picture
+
+
+def irradiance(field: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The relative irradiance map (H, W) in colours, logarithmic, with its colour bar (Fig. 10)."""
+    valid = valid & np.isfinite(field)
+    log = np.log2(np.maximum(field[valid], 1e-6))
+    low, high = np.percentile(log, [0.5, 99.5])
+    # At least 20 % of range: a constant field must not show its noise in full colour.
+    middle, half = (low + high) / 2, max((high - low) / 2, 0.13)
+    low, high = middle - half, middle + half
+    h = len(field)
+    level = (np.log2(np.maximum(np.where(valid, field, 1), 1e-6)) - low) / (high - low)
+    picture = _colors(level)
+    picture[~valid] = BACKGROUND
+    unit = max(h / 700, 0.35)  # letters grow with the picture
+    bar_x, bar_w, bar_h = int(24 * unit), int(26 * unit), int(0.8 * h)
+    side = np.full((h, int(128 * unit), 3), BACKGROUND, np.uint8)
+    y0 = (h - bar_h) // 2
+    ramp = _colors(np.linspace(1, 0, bar_h)[:, None])
+    side[y0 : y0 + bar_h, bar_x : bar_x + bar_w] = ramp
+    for tick in _ticks(2**low, 2**high):
+        y = int(y0 + bar_h * (1 - (np.log2(tick) - low) / (high - low)))
+        cv2.line(side, (bar_x + bar_w, y), (bar_x + bar_w + int(6 * unit), y), INK, max(1, int(unit)))
+        _write(side, f"{tick:g}", (bar_x + bar_w + int(11 * unit), y + int(6 * unit)), int(18 * unit), INK)
+    _write(side, "irradiance", (bar_x, y0 - int(28 * unit)), int(16 * unit), INK)
+    _write(side, "geom. mean 1", (bar_x, y0 - int(9 * unit)), int(13 * unit), FAINT)
+    return np.hstack([picture, side])
+
+
+# ---------------------------------------------------------------------------------------------------- parts
+
+
+def _radius(xy: np.ndarray, shape: tuple[int, int]) -> float:
+    """A radius in px at which circles fill the picture and do not overlap: 0.45 × the usual distance of neighbours."""
+    if len(xy) < 2:
+        return 0.03 * max(shape)
+    from scipy.spatial import cKDTree
+
+    apart = np.median(cKDTree(xy).query(xy, k=2)[0][:, 1])
+    return float(np.clip(0.45 * apart, 0.005 * max(shape), 0.03 * max(shape)))
+
+
+def _pixels(points: np.ndarray, zoom: float) -> np.ndarray:
+    """Photograph px to drawing coordinates in the enlarged picture; pixel centres are at integers in both."""
+    return np.round(((points + 0.5) * zoom - 0.5) * 2**_SUB).astype(np.int32)
+
+
+def _traffic_light(p: float) -> tuple[int, int, int]:
+    """Green for 1, yellow for a half, red for 0."""
+    red, yellow, green = np.array([[226, 44, 52], [247, 198, 40], [38, 200, 92]])
+    r, g, b = yellow + ((green - yellow) * (2 * p - 1) if p > 0.5 else (red - yellow) * (1 - 2 * p))
+    return int(r), int(g), int(b)
+
+
+def _legend(picture: np.ndarray, words: str, colors: list[tuple[str, float]]) -> np.ndarray:
+    strip = np.full((44, picture.shape[1], 3), BACKGROUND, np.uint8)
+    x = _write(strip, words, (14, 28), 18, INK) + 26
+    for name, p in colors:
+        cv2.circle(strip, (x, 22), 7, _traffic_light(p), 3, cv2.LINE_AA)
+        x = _write(strip, name, (x + 14, 28), 18, INK) + 26
+    return np.vstack([picture, strip])
+
+
+def _tiles(texton: Arrays, tile: int) -> list[np.ndarray]:
+    """The appearance after 1, 5, 10, 20 iterations, one exposure for all, fading where the texton's domain ends."""
+    domain = np.clip(texton["domain"] / max(float(texton["domain"].max(initial=0)), 1e-6), 0, 1)
+    inside = texton["appearance"][domain > 0.3]
+    bright = float(np.percentile(inside[np.isfinite(inside)], 99)) if np.isfinite(inside).any() else 1.0
+    alpha = cv2.resize(np.sqrt(domain).astype(np.float32), (tile, tile), interpolation=cv2.INTER_LINEAR)[..., None]
+    tiles = []
+    for view in texton["progress"]:
+        large = cv2.resize(np.nan_to_num(view), (tile, tile), interpolation=cv2.INTER_CUBIC)
+        color = to_display(large, 0.9 / max(bright, 1e-6))
+        tiles.append((alpha * color + (1 - alpha) * np.array(BACKGROUND) + 0.5).astype(np.uint8))
+    return tiles
+
+
+def _caption(picture: np.ndarray, texton: Arrays, number: int, count: int, at: tuple[int, int]) -> None:
+    x, y = at
+    _write(picture, f"texton {number}", (x, y), 15, INK, 600)
+    if texton["usable"]:
+        _write(picture, f"{count} instances", (x, y + 19), 14, INK)
+        if np.isfinite(texton["metric_residual"]):
+            _write(picture, f"residual {float(texton['metric_residual']):.3f}", (x, y + 37), 13, FAINT)
+        return
+    for i, line in enumerate(textwrap.wrap(str(texton["reason"]) or "not usable", 27, max_lines=3, placeholder=" …")):
+        _write(picture, line, (x, y + 18 + 17 * i), 13, WARNING)
+
+
+def _missing(frontal: list[Arrays]) -> list[str]:
+    reasons: dict[str, int] = {}
+    for texton in frontal:
+        reason = str(texton["reason"]) or "no reason given"
+        reasons[reason] = reasons.get(reason, 0) + 1
+    ordered = sorted(reasons.items(), key=lambda r: -r[1])
+    lines = [f"not shown: {n} cluster{'s' * (n != 1)} without an appearance ({reason})" for reason, n in ordered[:6]]
+    rest = sum(n for _, n in ordered[6:])
+    return lines + ([f"and {rest} more, for other reasons"] if rest else [])
+
+
+def _colors(level: np.ndarray) -> np.ndarray:
+    """0…1 to colours, (h, w, 3) RGB."""
+    return cv2.applyColorMap((np.clip(level, 0, 1) * 255 + 0.5).astype(np.uint8), cv2.COLORMAP_INFERNO)[
+        ..., ::-1
+    ].copy()
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Four to ten round numbers in a range of ratios."""
+    for steps in (
+        [1],
+        [1, 2, 5],
+        [1, 1.5, 2, 3, 5, 7],
+        [k / 10 for k in range(10, 100)],
+        [k / 50 for k in range(50, 500)],
+    ):
+        found = sorted(s * 10.0**e for e in range(-6, 7) for s in steps if low <= s * 10.0**e <= high)
+        if len(found) >= 4:
+            return [float(f"{t:.4g}") for t in found[:: -(-len(found) // 10)]]
+    return [float(f"{t:.3g}") for t in np.geomspace(low, high, 4)]
+
+
+def _write(
+    picture: np.ndarray, text: str, at: tuple[int, int], size: int, color: tuple[int, int, int], weight: int = 400
+) -> int:
+    """Write text with its base line's left end `at`, in place; returns the x where it ends."""
+    return int(cv2.putText(picture, text, at, color, cv2.FontFace("sans"), size, weight)[0][0])
