@@ -107,6 +107,8 @@ class _Run:
             result.stages[name].jobs = len(step.keys)
         for job, reason in plan.todo:
             self._enqueue(number, job, reason)
+        if result.error:
+            return
         for name in {job.stage for job, _ in plan.todo}:
             self._tell(number, name)
         if not plan.todo:

@@ -1,11 +1,22 @@
+import os
+
 import pytest
 
 
+@pytest.fixture(scope="session")
+def log(tmp_path_factory):
+    """Where the toy stages count their executions: one folder for all tests, as worker processes live longer than one."""
+    path = tmp_path_factory.mktemp("log")
+    os.environ["TOY_LOG"] = str(path)
+    yield path
+    del os.environ["TOY_LOG"]
+
+
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder with two inputs a.txt and b.txt, and the log in which the toy stages count their executions."""
+def folder(tmp_path, log):
+    """A folder with two inputs a.txt and b.txt; nothing counted yet."""
     (tmp_path / "a.txt").write_text("1 2 3")
     (tmp_path / "b.txt").write_text("4 5")
-    (tmp_path / "log").mkdir()
-    monkeypatch.setenv("TOY_LOG", str(tmp_path / "log"))
+    for path in log.iterdir():
+        path.unlink()
     return tmp_path
