@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import signal
 import sys
 import tempfile
 import time
@@ -23,6 +24,7 @@ _FOLDERS = [_ROOT / "../shared/scenes", _ROOT / "../shared/real", _ROOT / "data/
 def main(argv: Sequence[str] | None = None) -> int:
     """Run or compare benchmarks. Returns the exit code: 0, or 2 if there is nothing to do."""
     args = _parse(argv)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the run in hand is stopped too
     try:
         if args.compare:
             print(compare(_read(args.compare[0]), _read(args.compare[1])))
@@ -86,7 +88,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("folders", nargs="*", type=Path, default=_FOLDERS, help="of images")
     parser.add_argument("--scenes", default="", help="globs of image names, separated by spaces or commas")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="where bench.md and bench.json go")
-    parser.add_argument("--work", type=Path, help="keep the results there (default: a fresh folder, removed at the end)")
+    parser.add_argument("--work", type=Path, help="keep the results there (default: fresh, removed at the end)")
     parser.add_argument("--config", type=Path, help="configuration (default: sftex's own)")
     parser.add_argument("--jobs", type=int, help="processes (default: all processors)")
     parser.add_argument("--limit", type=float, default=1800.0, help="seconds after which a run counts as failed")
