@@ -93,4 +93,4 @@ def _contents(arrays: Mapping[str, Any], meta: Mapping[str, Any], scratch: Path)
 
 
 def _png(picture: np.ndarray) -> bytes:
-    return cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 4])[1].tobytes()
+    return cv2.imencode(".png", picture[..., ::-1])[1].tobytes()

@@ -156,14 +156,27 @@ def _legend(picture: np.ndarray, words: str, colors: list[tuple[str, float]]) ->
 def _tiles(texton: Arrays, tile: int) -> list[np.ndarray]:
     """The appearance after 1, 5, 10, 20 iterations, one exposure for all, fading where the texton's domain ends."""
     domain = np.clip(texton["domain"] / max(float(texton["domain"].max(initial=0)), 1e-6), 0, 1)
-    inside = texton["appearance"][domain > 0.3]
+    y, x = np.nonzero(domain > 0.15)
+    if len(y):  # the grid may be far larger than what was learnt to be the element
+        side = max(int(np.ptp(y)), int(np.ptp(x)), 8) // 2 + 1
+        cy, cx = int(y.min() + y.max()) // 2, int(x.min() + x.max()) // 2
+        box = np.s_[max(cy - side, 0) : cy + side + 1, max(cx - side, 0) : cx + side + 1]
+    else:
+        box = np.s_[:, :]
+    domain = domain[box]
+    inside = texton["appearance"][box][domain > 0.3]
     bright = float(np.percentile(inside[np.isfinite(inside)], 99)) if np.isfinite(inside).any() else 1.0
-    alpha = cv2.resize(np.sqrt(domain).astype(np.float32), (tile, tile), interpolation=cv2.INTER_LINEAR)[..., None]
+    fit = tile / max(domain.shape)
+    alpha = cv2.resize(np.sqrt(domain).astype(np.float32), None, fx=fit, fy=fit)[..., None]
     tiles = []
     for view in texton["progress"]:
-        large = cv2.resize(np.nan_to_num(view), (tile, tile), interpolation=cv2.INTER_CUBIC)
+        large = cv2.resize(np.nan_to_num(view[box]), alpha.shape[1::-1], interpolation=cv2.INTER_CUBIC)
         color = to_display(large, 0.9 / max(bright, 1e-6))
-        tiles.append((alpha * color + (1 - alpha) * np.array(BACKGROUND) + 0.5).astype(np.uint8))
+        blended = (alpha * color + (1 - alpha) * np.array(BACKGROUND) + 0.5).astype(np.uint8)
+        blank = np.full((tile, tile, 3), BACKGROUND, np.uint8)
+        y0, x0 = (tile - alpha.shape[0]) // 2, (tile - alpha.shape[1]) // 2
+        blank[y0 : y0 + alpha.shape[0], x0 : x0 + alpha.shape[1]] = blended
+        tiles.append(blank)
     return tiles
 
 
