@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import struct
 import zlib
 from pathlib import Path
@@ -95,23 +96,59 @@ def test_declared_curves_are_honoured_and_unknown_ones_refused(tmp_path: Path) -
     np.testing.assert_allclose(forced, srgb(v), atol=1e-7)
 
 
-def test_grey_palette_one_bit_and_cmyk(tmp_path: Path) -> None:
-    image_module = pytest.importorskip("PIL.Image", reason="Pillow writes palette, 1-bit and CMYK files for this test")
+def png(depth: int, color_type: int, rows: list[bytes], width: int, *chunks: bytes) -> bytes:
+    header = struct.pack(">IIBBBBB", width, len(rows), depth, color_type, 0, 0, 0)
+    body = zlib.compress(b"".join(b"\0" + row for row in rows))
+    parts = [png_chunk(b"IHDR", header), *chunks, png_chunk(b"IDAT", body), png_chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def tiff(width: int, height: int, bits: int, samples: int, photometric: int, data: bytes) -> bytes:
+    """Uncompressed little-endian TIFF; photometric 1 = black is zero, 5 = CMYK."""
+    tags = [(256, width), (257, height), (258, bits), (259, 1), (262, photometric), (273, 8), (277, samples)]
+    tags += [(278, height), (279, len(data)), (284, 1)]
+    count = 4 if samples == 4 else 1  # BitsPerSample of all samples lies behind the pixels
+    entries = b"".join(
+        struct.pack("<HHIHH", tag, 3, 1, value, 0)
+        if (tag, count) != (258, 4)
+        else struct.pack("<HHII", tag, 3, 4, 8 + len(data))
+        for tag, value in tags
+    )
+    tail = struct.pack("<4H", *[bits] * 4)
+    start = struct.pack("<2sHI", b"II", 42, 8 + len(data) + len(tail))
+    return start + data + tail + struct.pack("<H", len(tags)) + entries + bytes(4)
+
+
+def test_grey_palette_and_one_bit(tmp_path: Path) -> None:
     grey = PIXELS[..., 0]
     expected = np.repeat(srgb(grey / 255)[..., None], 3, 2)
     np.testing.assert_allclose(load_image(write(tmp_path / "g.png", grey[..., None]))[0], expected, atol=1e-7)
-    pil = image_module.fromarray(np.ascontiguousarray(PIXELS[..., :3]))
-    palette = pil.convert("P")
-    palette.save(tmp_path / "p.png")
-    shown = np.array(palette.convert("RGB"))
-    np.testing.assert_allclose(load_image(tmp_path / "p.png")[0], srgb(shown / 255), atol=1e-7)
-    for ending in ("png", "tif"):
-        image_module.fromarray(grey > 127).save(tmp_path / f"bit.{ending}")
-        np.testing.assert_array_equal(load_image(tmp_path / f"bit.{ending}")[0][..., 1], grey > 127)
-    flat = image_module.new("RGB", (16, 16), (200, 60, 30)).convert("CMYK")
+    palette = np.random.default_rng(5).integers(0, 256, (256, 3), dtype=np.uint8)
+    chunk = png_chunk(b"PLTE", palette.tobytes())
+    (tmp_path / "p.png").write_bytes(png(8, 3, [r.tobytes() for r in grey], 17, chunk))
+    np.testing.assert_allclose(load_image(tmp_path / "p.png")[0], srgb(palette[grey] / 255), atol=1e-7)
+    bits = np.packbits(grey > 127, axis=1)
+    (tmp_path / "b.png").write_bytes(png(1, 0, [r.tobytes() for r in bits], 17))
+    (tmp_path / "b.tif").write_bytes(tiff(17, 12, 1, 1, 1, bits.tobytes()))
+    for name in ("b.png", "b.tif"):
+        np.testing.assert_array_equal(load_image(tmp_path / name)[0][..., 1], grey > 127)
+
+
+#: An 8 × 8 CMYK JPEG as Photoshop and Pillow write them (inverted), of sRGB (200, 60, 30).
+CMYK_JPEG = (
+    "|JeWT01iQ9Z(?NtWB>pF0095n07C!`2?`4e2n`Dg3l0tq4-+626A}^=CmbFZATB8}FfJ)AEHgSvJ~K8(H!LkcS3yQhPEu1+GCo>iT2Nq0QBqI;zyK5o"
+    "00;mG1Va%3O%VWD5dcdO0RO}Q6#xMN000000000000000000ID|HJ?k5CH%H0000000000000000095m01gC008Ic{080P>KLA)N2B$y&*#"
+)
+
+
+def test_cmyk(tmp_path: Path) -> None:
+    (tmp_path / "c.jpg").write_bytes(base64.b85decode(CMYK_JPEG))
+    ink = bytes(255 - v for v in (200, 60, 30)) + b"\0"
+    (tmp_path / "c.tif").write_bytes(tiff(8, 8, 8, 4, 5, ink * 64))
     for name in ("c.jpg", "c.tif"):
-        flat.save(tmp_path / name)
-        np.testing.assert_allclose(load_image(tmp_path / name)[0][8, 8], srgb(np.array([200, 60, 30]) / 255), atol=0.03)
+        rgb, mask = load_image(tmp_path / name)
+        np.testing.assert_allclose(rgb[4, 4], srgb(np.array([200, 60, 30]) / 255), atol=0.03)
+        assert rgb.shape == (8, 8, 3) and mask.all()
 
 
 def test_alpha_is_a_mask_and_does_not_darken(tmp_path: Path) -> None:

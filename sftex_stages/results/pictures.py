@@ -157,12 +157,11 @@ def _tiles(texton: Arrays, tile: int) -> list[np.ndarray]:
     """The appearance after 1, 5, 10, 20 iterations, one exposure for all, fading where the texton's domain ends."""
     domain = np.clip(texton["domain"] / max(float(texton["domain"].max(initial=0)), 1e-6), 0, 1)
     y, x = np.nonzero(domain > 0.15)
+    box: tuple[slice, slice] = (slice(None), slice(None))
     if len(y):  # the grid may be far larger than what was learnt to be the element
         side = max(int(np.ptp(y)), int(np.ptp(x)), 8) // 2 + 1
         cy, cx = int(y.min() + y.max()) // 2, int(x.min() + x.max()) // 2
-        box = np.s_[max(cy - side, 0) : cy + side + 1, max(cx - side, 0) : cx + side + 1]
-    else:
-        box = np.s_[:, :]
+        box = (slice(max(cy - side, 0), cy + side + 1), slice(max(cx - side, 0), cx + side + 1))
     domain = domain[box]
     inside = texton["appearance"][box][domain > 0.3]
     bright = float(np.percentile(inside[np.isfinite(inside)], 99)) if np.isfinite(inside).any() else 1.0

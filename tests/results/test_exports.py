@@ -154,7 +154,7 @@ def test_glb_bytes(surface: exports.Mesh, arrays: dict) -> None:
 
 
 def test_trimesh_reads_both(tmp_path: Path, surface: exports.Mesh, arrays: dict) -> None:
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = pytest.importorskip("trimesh", reason="trimesh, a development dependency, reads the meshes back")
     photo = exports.to_display(arrays["image"]["rgb"])
     scene = trimesh.load_scene(io.BytesIO(exports.glb(surface, exports.texture(photo), (90, 130), "")), file_type="glb")
     (model,) = scene.geometry.values()
