@@ -1,7 +1,7 @@
 """Cholesky factor, solutions, determinant and the needed part of the inverse of a block tridiagonal matrix.
 
-The precision of a spline field (`spline.py`) couples grid rows that are at most three apart, so in blocks of three rows it is
-block tridiagonal. All work is done by BLAS on dense blocks; the cost grows as (grid size)^2 and no fill-in is stored outside.
+The precision of a spline field (`spline.py`) couples grid rows that are at most three apart, so in blocks of three rows it
+is block tridiagonal. All work is done by BLAS on dense blocks, and no fill-in arises outside them.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, get_blas_funcs, get_lapack_funcs
 
 Float = NDArray[np.float64]
+Matrix = tuple[Float, Float]  # symmetric: blocks on the diagonal (B, b, b), blocks below it (B - 1, b, b)
 
 _potrf, _trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 (_trsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
@@ -26,8 +27,8 @@ class Factor:
     logdet: float
 
 
-def split(matrix: sp.spmatrix, b: int) -> tuple[Float, Float]:
-    """Dense diagonal blocks (B, b, b) and blocks below the diagonal (B - 1, b, b) of a sparse symmetric matrix."""
+def split(matrix: sp.spmatrix, b: int) -> Matrix:
+    """The blocks of a sparse symmetric matrix whose duplicates are summed."""
     coo = matrix.tocoo()
     count = coo.shape[0] // b
     i, r = np.divmod(coo.row, b)
@@ -41,21 +42,21 @@ def split(matrix: sp.spmatrix, b: int) -> tuple[Float, Float]:
     return diagonal, below
 
 
-def factor(matrix: sp.spmatrix, b: int) -> Factor:
-    """Factor a symmetric positive definite matrix that is block tridiagonal in blocks of `b`. Duplicates must be summed.
+def factor(matrix: Matrix) -> Factor:
+    """Factor a symmetric positive definite matrix.
 
     Raises
     ------
     scipy.linalg.LinAlgError
         if the matrix is not positive definite.
     """
-    diagonal, below = split(matrix, b)
-    for k in range(len(diagonal)):
-        block = diagonal[k]
+    diagonal, below = np.empty_like(matrix[0]), np.empty_like(matrix[1])
+    for k, block in enumerate(matrix[0]):
         if k:
-            below[k - 1] = _trsm(1.0, diagonal[k - 1].T, below[k - 1].T, lower=0, trans_a=1).T
+            # Row-major L is column-major Lᵀ, which is what BLAS takes without a copy.
+            below[k - 1] = _trsm(1.0, diagonal[k - 1].T, matrix[1][k - 1].T, lower=0, trans_a=1).T
             block = block - below[k - 1] @ below[k - 1].T
-        upper, info = _potrf(block, lower=0, clean=1)
+        upper, info = _potrf(block.T, lower=0, clean=1)
         if info:
             raise LinAlgError(f"block {k} is not positive definite (order {info})")
         diagonal[k] = upper.T
@@ -78,8 +79,8 @@ def solve(f: Factor, rhs: Float) -> Float:
     return x.reshape(np.shape(rhs))
 
 
-def selected_inverse(f: Factor) -> tuple[Float, Float]:
-    """Blocks of A⁻¹ where A has its own: on the diagonal (B, b, b) and below it (B - 1, b, b), by Takahashi's recursion."""
+def selected_inverse(f: Factor) -> Matrix:
+    """Blocks of A⁻¹ on and below the diagonal, by Takahashi's recursion."""
     count = len(f.diagonal)
     diagonal = np.empty_like(f.diagonal)
     below = np.empty_like(f.below)
@@ -93,8 +94,8 @@ def selected_inverse(f: Factor) -> tuple[Float, Float]:
     return diagonal, below
 
 
-def covariance(inverse: tuple[Float, Float], index: NDArray[np.int64], left: Float, right: Float) -> Float:
-    """`left_i A⁻¹ right_iᵀ` (N, p, q) for stencils: coefficients `index` (N, k), weights `left` (N, p, k), `right` (N, q, k).
+def covariance(inverse: Matrix, index: NDArray[np.int64], left: Float, right: Float) -> Float:
+    """`left_i A⁻¹ right_iᵀ` (N, p, q) for stencils of coefficients `index` (N, k), weights (N, p, k) and (N, q, k).
 
     All coefficients of a stencil must lie in the same or in adjacent blocks.
     """
@@ -102,10 +103,8 @@ def covariance(inverse: tuple[Float, Float], index: NDArray[np.int64], left: Flo
     b = diagonal.shape[1]
     block, inner = np.divmod(index, b)
     bi, bj = block[:, :, None], block[:, None, :]
+    flat = np.concatenate((diagonal.ravel(), below.ravel()))
     i, j = inner[:, :, None], inner[:, None, :]
-    values = diagonal[np.maximum(bi, bj), i, j]
-    if len(below):
-        last = len(below) - 1
-        values = np.where(bi > bj, below[np.minimum(bj, last), i, j], values)
-        values = np.where(bi < bj, below[np.minimum(bi, last), j, i], values)
-    return np.einsum("npk,nkl,nql->npq", left, values, right, optimize=True)
+    number = np.where(bi == bj, bi, len(diagonal) + np.minimum(bi, bj))
+    values = flat[np.where(bi >= bj, (number * b + i) * b + j, (number * b + j) * b + i)]
+    return (left @ values) @ np.swapaxes(right, 1, 2)

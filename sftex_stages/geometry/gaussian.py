@@ -1,11 +1,11 @@
 """A spline field conditioned on Gaussian data about its gradient: the linear algebra shared by signs and refinement.
 
-Data speak about the gradient g_i = grad h(x_i) through `½ g_iᵀ W_i g_i − v_iᵀ g_i`: information `W_i` (2, 2) and pull `v_i` (2,)
-(a measurement y_i with precision W_i pulls with W_i y_i). The prior is `spline.energy`. With `B` the gradient design the
-posterior precision is `A = Bᵀ W B + P`, the mean `A⁻¹ Bᵀ v`, and the field can be integrated out in closed form.
+Data speak about the gradient g_i = grad h(x_i) through `½ g_iᵀ W_i g_i − v_iᵀ g_i`: information `W_i` (2, 2) and pull
+`v_i` (2,); a measurement y_i of precision W_i pulls with W_i y_i. The prior is that of `spline.py`. With `B` the gradient
+design, the posterior precision is `A = Bᵀ W B + P`, the mean `A⁻¹ Bᵀ v`, and the field is integrated out in closed form.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,64 +14,127 @@ from numpy.typing import NDArray
 from sftex_stages.geometry import blocks, spline
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
-HEIGHT_SCALE = 3.0  # standard deviation of the free constant of h, of the extent
+HEIGHT_SCALE = 1.0  # standard deviation of the free constant of h, in extents
 SLOPE_SCALE = 3.0  # standard deviation of an overall lean; both make evidences of different priors comparable
 
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Prior precision `strength * (E2 + reach² E3)`: gradients vary by about 1/sqrt(strength), smoothly below `reach` px."""
+    """Prior precision `strength * (E2 + reach² E3)`: gradients vary by about 1/sqrt(strength), smoothly below `reach`."""
 
     strength: float
-    reach: float
+    reach: float  # px
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Where the products of N stencils go in the blocks of a block tridiagonal matrix."""
+
+    position: Int  # into diagonal blocks followed by blocks below, for those of the N * 256 pairs in `keep`
+    keep: Int
+    count: int
+    b: int
+
+    def __call__(self, products: Float) -> blocks.Matrix:
+        """Sum of `products` (N, 16, 16)."""
+        size = self.b * self.b
+        flat = np.bincount(self.position, products.ravel()[self.keep], (2 * self.count - 1) * size)
+        cut = self.count * size
+        return flat[:cut].reshape(-1, self.b, self.b), flat[cut:].reshape(-1, self.b, self.b)
+
+
+def scatter(grid: spline.Grid, index: Int) -> Scatter:
+    """The scatter of stencils with coefficients `index` (N, 16)."""
+    b = spline.BLOCK * grid.shape[1]
+    block, inner = np.divmod(index, b)
+    count = grid.size // b
+    bi, bj = block[:, :, None], block[:, None, :]
+    lower = np.flatnonzero((bi >= bj).ravel())
+    number = np.where(bi == bj, bi, count + bj)
+    position = (number * b + inner[:, :, None]) * b + inner[:, None, :]
+    return Scatter(position.ravel()[lower], lower, count, b)
 
 
 @dataclass(frozen=True)
 class Field:
-    """A grid with the gradient stencils of N points on it and the energies of its prior."""
+    """A grid with the gradient stencils of N points on it and the energies of its prior, E0 … E3, as blocks."""
 
     grid: spline.Grid
-    index: NDArray[np.int64]  # (N, 16)
+    index: Int  # (N, 16)
     stencil: Float  # (N, 2, 16), gradient in px/px
-    design: sp.csr_matrix  # (2N, M), the same, rows interleaved
-    energies: tuple[sp.csr_matrix, ...]  # E0 … E3
+    value: Float  # (N, 16), height in px
+    design: sp.csr_matrix  # (2N, M): the gradient stencils, rows interleaved
+    add: Scatter
+    energies: tuple[blocks.Matrix, ...]
+    logdets: dict[Smoothness, float] = field(default_factory=dict, compare=False)  # of priors, as they are asked for
 
-    @property
-    def block(self) -> int:
-        return spline.BLOCK * self.grid.shape[1]
 
-
-def field(grid: spline.Grid, xy: Float) -> Field:
+def make_field(grid: spline.Grid, xy: Float) -> Field:
     """The field of that grid with points `xy` (N, 2) px."""
     index, p = spline.stencil(grid, xy, 1, 0)
     stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
-    energies = tuple(spline.energy(grid, m) for m in range(4))
-    return Field(grid, index, stencil, spline.gradient_design(grid, xy), energies)
+    add = scatter(grid, index)
+    energies = tuple(blocks.split(spline.energy(grid, m), add.b) for m in range(4))
+    return Field(grid, index, stencil, spline.stencil(grid, xy)[1], spline.gradient_design(grid, xy), add, energies)
 
 
-def prior(f: Field, smooth: Smoothness) -> sp.csr_matrix:
-    """Prior precision P (M, M), positive definite; its lowest terms are weak and fixed."""
-    extent = np.array(f.grid.cells) * f.grid.spacing
-    area = extent.prod()
-    weak = f.energies[0] / (area * (HEIGHT_SCALE**2) * area) + f.energies[1] / (area * SLOPE_SCALE**2)
-    return weak + smooth.strength * (f.energies[2] + smooth.reach**2 * f.energies[3])
+def prior(f: Field, smooth: Smoothness) -> blocks.Matrix:
+    """Prior precision P, positive definite; its lowest terms are weak and fixed."""
+    area = float(np.prod(f.grid.cells)) * f.grid.spacing**2
+    weights = (
+        1 / (area * HEIGHT_SCALE) ** 2,
+        1 / (area * SLOPE_SCALE**2),
+        smooth.strength,
+        smooth.strength * smooth.reach**2,
+    )
+    return (
+        sum(w * e[0] for w, e in zip(weights, f.energies, strict=True)),
+        sum(w * e[1] for w, e in zip(weights, f.energies, strict=True)),
+    )  # type: ignore[return-value]
 
 
-def weighted(f: Field, weight: Float) -> sp.csr_matrix:
-    """Rows `W_i B_i` (2N, M) for `weight` (N, 2, 2)."""
-    data = np.einsum("npq,nqk->npk", weight, f.stencil)
-    return sp.csr_matrix((data.ravel(), f.design.indices, f.design.indptr), shape=f.design.shape)
+def reasonable(f: Field, strength: float, reach: float) -> bool:
+    """Whether a prior is within what the grid can show and double precision can hold."""
+    extent = max(f.grid.cells) * f.grid.spacing
+    return 1e-3 <= strength <= 1e5 and 0.05 * f.grid.spacing <= reach <= 0.6 * extent
 
 
-def posterior(f: Field, weight: Float, precision: sp.csr_matrix) -> blocks.Factor:
-    """Factor of A = Bᵀ W B + P."""
-    return blocks.factor(f.design.T @ weighted(f, weight) + precision, f.block)
+def prior_logdet(f: Field, smooth: Smoothness) -> float:
+    """log det P, remembered."""
+    if smooth not in f.logdets:
+        f.logdets[smooth] = blocks.factor(prior(f, smooth)).logdet
+    return f.logdets[smooth]
+
+
+def posterior(f: Field, weight: Float, precision: blocks.Matrix, height: Float | None = None) -> blocks.Factor:
+    """Factor of A = Bᵀ W B + P for `weight` (N, 2, 2), and optionally precisions (N,) of measured heights."""
+    products = np.swapaxes(f.stencil, 1, 2) @ (weight @ f.stencil)
+    if height is not None:
+        products += height[:, None, None] * f.value[:, :, None] * f.value[:, None, :]
+    diagonal, below = f.add(products)
+    return blocks.factor((diagonal + precision[0], below + precision[1]))
+
+
+def pulled(f: Field, pull: Float) -> Float:
+    """`Bᵀ v` (M, …) of pulls (N, 2, …) on the gradients."""
+    return np.asarray(f.design.T @ pull.reshape(-1, *pull.shape[2:]))
+
+
+def lifted(f: Field, pull: Float) -> Float:
+    """The same (M,) for pulls (N,) on the heights."""
+    return np.bincount(f.index.ravel(), (pull[:, None] * f.value).ravel(), f.grid.size)
+
+
+def heights(f: Field, a: Float) -> Float:
+    """Heights (N,) at the points for coefficients (M,)."""
+    return (f.value * a[f.index]).sum(1)
 
 
 def gradients(f: Field, a: Float) -> Float:
     """Gradients (N, 2) or (N, 2, S) at the points for coefficients (M,) or (M, S)."""
-    return (f.design @ a).reshape(len(f.index), 2, *a.shape[1:])
+    return np.asarray((f.design @ a).reshape(len(f.index), 2, *a.shape[1:]))
 
 
 def gradient_covariance(f: Field, factor: blocks.Factor) -> Float:
@@ -88,7 +151,6 @@ def without_own(g: Float, covariance: Float, weight: Float, pull: Float) -> tupl
 
 def log_evidence(f: Field, weight: Float, pull: Float, smooth: Smoothness) -> float:
     """log of the integral of exp(−½ gᵀ W g + vᵀ g) over the prior of the field, in nats."""
-    precision = prior(f, smooth)
-    factor = posterior(f, weight, precision)
-    b = f.design.T @ pull.ravel()
-    return 0.5 * (float(b @ blocks.solve(factor, b)) + blocks.factor(precision, f.block).logdet - factor.logdet)
+    factor = posterior(f, weight, prior(f, smooth))
+    b = pulled(f, pull)
+    return 0.5 * (float(b @ blocks.solve(factor, b)) + prior_logdet(f, smooth) - factor.logdet)

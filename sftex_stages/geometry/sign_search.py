@@ -1,93 +1,158 @@
-"""Many starts, several smoothnesses, one measure: the search for the sign pattern of greatest evidence.
+"""Many starts, several smoothnesses, every cue, one measure: the search for the sign pattern of greatest evidence.
 
 Every smoothness of a ladder, smooth to rough, anneals all starts (leading eigenvectors, the paper's cylinder in four
-directions, bowl, light directions) and hands its patterns on as starts of the next. The distinct patterns at the end are
-judged by their evidence, each with its own best smoothness and noise and with outliers let go, so that patterns found with
-different settings compare.
+directions, leaning planes, a bowl, lights from six azimuths), with and without shading, moves whole regions, and hands its
+patterns on as starts of the next. The best distinct patterns are then judged by their evidence, each with its own best
+smoothness and noise and with outliers let go, so that patterns found with different settings compare.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import gaussian, signs
+from sftex_stages.geometry import blocks, gaussian, shading, signs
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
-LADDER = ((3.0, 8.0), (1.0, 4.0), (1.0, 2.0), (1.0, 1.0))  # strength, reach in mean spacings of instances
-OUTLIER = 0.05  # prior share of instances that are not from the surface
+LADDER = ((3.0, 8.0), (1.0, 4.0), (1.0, 2.0), (1.0, 0.7))  # strength, reach in spacings of nodes
+ANNEAL_STEPS, LIGHT_EVERY = 24, 6
+OUTLIER = 0.05  # prior share of nodes that are not from the surface
+SAY_OF_SHADING = 0.5  # of its log likelihood: what one light does not explain is correlated between neighbours
 
 
 @dataclass(frozen=True)
 class Data:
-    """Gradients up to sign `d` (N, 2) at `xy` (N, 2), covariance (N, 2, 2), log density (N,) of an outlier there."""
+    """Nodes at `xy` (N, 2) px: gradient up to sign `d` (N, 2), its covariance (N, 2, 2), belief `trust` (N,) in 0…1, log
+    density (N,) an outlier would have there, and irradiance against normals (None: no such cue)."""
 
     xy: Float
     d: Float
     covariance: Float
+    trust: Float
     log_outlier: Float
+    shading: shading.Shading | None
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sign pattern `s` (N,) and the evidence of it in nats, with the smoothness, noise factor and outliers it was found at."""
+    """A sign pattern `s` (N,): evidence of the shape and of the shading in nats, and the settings it was judged at."""
 
     s: Float
-    evidence: float
+    shape: float
+    shade: float
     smooth: gaussian.Smoothness
     noise: float
     inside: Float  # (N,) posterior of being from the surface
     gradient: Float  # (N, 2) of the surface
+    height: Float  # (N,) of the surface, px
+    light: shading.Light | None
     origin: str
 
+    @property
+    def evidence(self) -> float:
+        return self.shape + self.shade
 
-def geometric_starts(data: Data) -> tuple[Float, list[str]]:
-    """Signs (N, 5) that the paper's cylinder, in four directions, and a bowl would have (section 4, "Starting the method")."""
+
+def starts(data: Data) -> tuple[Float, list[str]]:
+    """Signs (N, S) of simple shapes: cylinders (section 4, "Starting the method"), leaning planes, a bowl, lit shapes."""
     centred = data.xy - np.median(data.xy, 0)
     angle = np.arange(4) * np.pi / 4
     axis = np.stack((np.cos(angle), np.sin(angle)))
-    slope = -(centred @ axis) * (data.d @ axis)
-    bowl = -(centred * data.d).sum(1, keepdims=True)
-    both = np.concatenate((slope, bowl), 1)
-    return np.where(both < 0, -1.0, 1.0), [f"cylinder {45 * k}" for k in range(4)] + ["bowl"]
+    lean = data.d @ axis
+    columns = [-(centred @ axis) * lean, lean, -(centred * data.d).sum(1, keepdims=True)]
+    names = [f"{kind} {45 * k}°" for kind in ("cylinder", "plane") for k in range(4)] + ["bowl"]
+    return np.where(np.concatenate(columns, 1) < 0, -1.0, 1.0), names
 
 
-def regions(data: Data, level: float) -> NDArray[np.int64]:
-    """Label (N,) of the connected patches in which the gradient turns slowly and is steeper than `level`."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+def lit_starts(data: Data) -> tuple[Float, list[str]]:
+    """Signs (N, 6) of surfaces lit from six azimuths in half a turn, by the shading alone."""
+    if data.shading is None:
+        return np.zeros((len(data.d), 0)), []
+    azimuths = np.arange(6) * np.pi / 6
+    return np.stack([shading.aligned(data.shading, t) for t in azimuths], 1), [f"light {30 * k}°" for k in range(6)]
 
-    n = len(data.xy)
-    tree = cKDTree(data.xy)
-    _, near = tree.query(data.xy, min(9, n))
-    i = np.repeat(np.arange(n), near.shape[1] - 1)
-    j = near[:, 1:].ravel()
+
+def neighbours(xy: Float, count: int = 6) -> tuple[Int, Int]:
+    """Pairs (E,), (E,) of points and their nearest `count` neighbours."""
+    near = cKDTree(xy).query(xy, min(count + 1, len(xy)))[1]
+    return np.repeat(np.arange(len(xy)), near.shape[1] - 1), near[:, 1:].ravel()
+
+
+def components(n: int, pairs: tuple[Int, Int], keep: NDArray[np.bool_]) -> Int:
+    """Label (N,) of the connected components of the kept pairs."""
+    i, j = pairs[0][keep], pairs[1][keep]
+    return connected_components(coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[1].astype(np.int64)
+
+
+def patches(data: Data, pairs: tuple[Int, Int], level: float) -> Int:
+    """Label (N,) of the patches in which the gradient turns slowly and stays steeper than `level`; the rest joins them."""
+    i, j = pairs
     size = np.linalg.norm(data.d, axis=1)
     aligned = np.abs((data.d[i] * data.d[j]).sum(1)) > 0.8 * size[i] * size[j]
-    keep = aligned & (size[i] > level) & (size[j] > level)
-    _, label = connected_components(coo_matrix((keep[keep], (i[keep], j[keep])), shape=(n, n)), directed=False)
-    count = np.bincount(label)
-    core = count[label] >= 3
+    label = components(len(size), pairs, aligned & (size[i] > level) & (size[j] > level))
+    core = np.bincount(label)[label] >= 3
     if not core.any():
-        return np.zeros(n, np.int64)
+        return np.zeros(len(size), np.int64)
     nearest = cKDTree(data.xy[core]).query(data.xy)[1]
-    return np.unique(label[core][nearest], return_inverse=True)[1]
+    return np.unique(label[core][nearest], return_inverse=True)[1].astype(np.int64)
+
+
+def bias_of(data: Data, m: Float, lit: NDArray[np.bool_], lights: list[shading.Light | None]) -> Float:
+    """Fields (N, S) of the shading on patterns `m` (N, S) of which those in `lit` (S,) use it; refits `lights` in place."""
+    bias = np.zeros_like(m)
+    if data.shading is not None:
+        for k in np.flatnonzero(lit):
+            lights[k] = light = shading.fit(data.shading, m[:, k], lights[k], 1 if lights[k] else 4)
+            bias[:, k] = SAY_OF_SHADING * data.trust * shading.pull(data.shading, light)
+    return bias
+
+
+def rung(
+    data: Data, c: signs.Coupling, patterns: Float, lit: NDArray[np.bool_], labels: list[Int], hot: float
+) -> Float:
+    """One smoothness: anneal, descend and move regions of patterns (N, S)."""
+    lights: list[shading.Light | None] = [None] * patterns.shape[1]
+    m = 0.7 * patterns
+    betas = np.geomspace(hot, 1.0, ANNEAL_STEPS)
+    for k in range(0, ANNEAL_STEPS, LIGHT_EVERY):
+        m = signs.anneal(c, m, bias_of(data, m, lit, lights), betas[k : k + LIGHT_EVERY])
+    s = np.where(m < 0, -1.0, 1.0)
+    for label in [None, *labels]:
+        bias = bias_of(data, s, lit, lights)
+        if label is not None:
+            s = np.stack([signs.flip_regions(c, s[:, j], bias[:, j], label) for j in range(s.shape[1])], 1)
+        s = signs.descend(c, s, bias)
+    return s
+
+
+def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
+    """Log likelihood that the shading gives signs `s` (N,), relative to a light that tells nothing."""
+    if data.shading is None:
+        return 0.0, None
+    null = shading.fit(data.shading, np.zeros(len(s)), directed=False, rounds=6).log_likelihood
+    light = shading.fit(data.shading, s, rounds=6)
+    return SAY_OF_SHADING * max(light.log_likelihood - null - 2.0, 0.0), light
 
 
 def judge(
-    data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, noise: float, trust: Float, rounds: int, origin: str
+    data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, noise: float, rounds: int, origin: str
 ) -> Candidate:
     """The evidence of pattern `s` (N,), tuning smoothness and noise for it and letting outliers go (variational bound)."""
     precision = np.linalg.inv(data.covariance)
     logdet = np.linalg.slogdet(precision)[1]
     y = data.d * s[:, None]
     fit = np.einsum("ni,nij,nj->n", y, precision, y)
-    inside = trust.copy()
+    inside = data.trust.copy()
 
     def score(x: Float) -> float:
         strength, reach, factor = np.exp(x)
+        if not gaussian.reasonable(f, strength, reach):
+            return -np.inf
         weight = precision * (inside / factor)[:, None, None]
         own = 0.5 * logdet - np.log(2 * np.pi) - np.log(factor) - 0.5 * fit / factor
         pull = np.einsum("nij,nj->ni", weight, y)
@@ -97,32 +162,35 @@ def judge(
         return value + float(rest.sum())
 
     best = np.log([smooth.strength, smooth.reach, noise])
-    g = np.zeros_like(y)
-    value = -np.inf
-    pace = np.array([0.7, 0.5, 0.5])
+    pace = np.array([0.7, 0.7, 0.7])
     for n in range(rounds + 1):
         if n:
-            value = score(best)
-            for k in range(3):
-                for sign in (1, -1):
-                    trial = best.copy()
-                    trial[k] += sign * pace[k]
-                    new = score(trial)
-                    if new > value:
-                        best, value = trial, new
-                        break
-        factor = np.exp(best[2])
+            best, moved = climb(score, best, pace)
+            pace = pace if moved else pace / 2
+        strength, reach, factor = map(float, np.exp(best))
+        smooth = gaussian.Smoothness(strength, reach)
         weight = precision * (inside / factor)[:, None, None]
-        a_factor = gaussian.posterior(f, weight, gaussian.prior(f, gaussian.Smoothness(*np.exp(best[:2]))))
         pull = np.einsum("nij,nj->ni", weight, y)
-        g = gaussian.gradients(f, _solve(f, a_factor, pull))
-        mean, alone = gaussian.without_own(g, gaussian.gradient_covariance(f, a_factor), weight, pull)
-        inside = trust * _inside(data, y - mean, alone, factor)
-    return Candidate(s, score(best), gaussian.Smoothness(*map(float, np.exp(best[:2]))), float(factor), inside, g, origin)
+        solved = gaussian.posterior(f, weight, gaussian.prior(f, smooth))
+        a = blocks.solve(solved, gaussian.pulled(f, pull))
+        g = gaussian.gradients(f, a)
+        mean, alone = gaussian.without_own(g, gaussian.gradient_covariance(f, solved), weight, pull)
+        inside = data.trust * _inside(data, y - mean, alone, factor)
+    shade, light = shade_of(data, s)
+    return Candidate(s, score(best), shade, smooth, factor, inside, g, gaussian.heights(f, a), light, origin)
 
 
-def _solve(f: gaussian.Field, factor: signs.blocks.Factor, pull: Float) -> Float:
-    return signs.blocks.solve(factor, f.design.T @ pull.ravel())
+def climb(score, x: Float, pace: Float) -> tuple[Float, bool]:  # type: ignore[no-untyped-def]
+    """One round of pattern search: the first better neighbour of `x` (K,) at ±`pace` (K,) along every axis in turn."""
+    value, moved = score(x), False
+    for k in range(len(x)):
+        for sign in (1, -1):
+            trial = x + sign * pace * (np.arange(len(x)) == k)
+            new = score(trial)
+            if new > value:
+                x, value, moved = trial, new, True
+                break
+    return x, moved
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -133,52 +201,58 @@ def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
     return 1 / (1 + np.exp(np.clip(data.log_outlier + np.log(OUTLIER) - log_in, -60, 60)))
 
 
-def search(data: Data, f: gaussian.Field, spacing: float, trust: Float, finalists: int = 4) -> list[Candidate]:
-    """The best sign patterns, best first.
+def distinct(patterns: Float, trust: Float, limit: float = 0.99) -> list[int]:
+    """Indices of the patterns (N, S) that no earlier one equals up to a global sign."""
+    keep: list[int] = []
+    for j in range(patterns.shape[1]):
+        if all(abs(np.average(patterns[:, j] * patterns[:, i], weights=trust)) < limit for i in keep):
+            keep.append(j)
+    return keep
 
-    Parameters
-    ----------
-    f : Field
-        with the points of `data`, on a grid about as fine as the instances' mean `spacing` (px).
-    trust : (N,)
-        0…1, how far the instance may be believed at all.
-    """
-    weight = np.linalg.inv(data.covariance) * trust[:, None, None]
-    patterns, names = geometric_starts(data)
-    labels = [regions(data, level) for level in (0.15, 0.3)]
-    found: list[tuple[Float, gaussian.Smoothness, str]] = []
+
+def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, survivors: int = 10) -> list[Candidate]:
+    """The best sign patterns, best first; `f` has the points of `data` on a grid about as fine as their `spacing` px."""
+    weight = np.linalg.inv(data.covariance) * data.trust[:, None, None]
+    patterns, names = starts(data)
+    pairs = neighbours(data.xy)
+    labels = [patches(data, pairs, level) for level in (0.15, 0.3)]
+    lit = np.zeros(len(names), bool)
+    pool: list[tuple[float, Float, gaussian.Smoothness, str]] = []
     for k, (strength, reach) in enumerate(LADDER):
         smooth = gaussian.Smoothness(strength, reach * spacing)
         c = signs.coupling(f, data.d, weight, smooth)
-        if k < 2:
-            spectral = signs.spectral_starts(c, 3)
-            patterns = np.concatenate((patterns, spectral), 1)
-            names = names + [f"spectral {j + 1} at {k}" for j in range(spectral.shape[1])]
-        bias = np.zeros_like(patterns)
-        hot = 3.0 / max(float(np.median(c.own[c.own > 0])), 1e-9)
-        patterns = signs.descend(c, signs.anneal(c, 0.5 * patterns, bias, min(hot, 1.0), 30), bias)
-        for label in labels:
-            moved = [signs.flip_regions(c, patterns[:, j], bias[:, j], label) for j in range(patterns.shape[1])]
-            patterns = signs.descend(c, np.stack(moved, 1), bias)
-        patterns, names = distinct(patterns, names, trust)
-        found += [(patterns[:, j], smooth, names[j]) for j in range(patterns.shape[1])]
-    first = [judge(data, f, s, smooth, 1.0, trust, 1, name) for s, smooth, name in found]
+        spectral = signs.spectral_starts(c, 3) if k < 2 else patterns[:, :0]
+        shaded, labels_lit = lit_starts(data)
+        patterns = np.concatenate((patterns, spectral, shaded), 1)
+        names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_lit
+        lit = np.concatenate((lit, np.zeros(spectral.shape[1], bool), np.ones(shaded.shape[1], bool)))
+        hot = min(5.0 / max(float(np.median(c.own[c.own > 0])), 1e-9), 1.0)
+        patterns = rung(data, c, patterns, lit, labels, hot)
+        if data.shading is not None:  # every pattern may go on with the shading, and without
+            patterns, names = np.concatenate((patterns, patterns), 1), names + names
+            lit = np.concatenate((lit, ~lit))
+        shape = 0.5 * c.log_det - signs.energies(c, patterns, np.zeros_like(patterns))
+        value = np.array([shape[j] + shade_of(data, patterns[:, j])[0] for j in range(len(names))])
+        order = np.argsort(-value, kind="stable")
+        order = order[distinct(patterns[:, order], data.trust)][:survivors]
+        patterns, names, lit = patterns[:, order], [names[j] for j in order], lit[order]
+        pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
+    first = [judge(data, f, s, smooth, 1.0, 1, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
-    kept: list[Candidate] = []
-    for x in first:
-        if all(abs(np.average(x.s * y.s, weights=trust)) < 0.995 for y in kept):
-            kept.append(x)
-    last = [judge(data, f, x.s, x.smooth, x.noise, trust, 3, x.origin) for x in kept[:finalists]]
+    last = [judge(data, f, x.s, x.smooth, x.noise, 3, x.origin) for x in first[:finalists]]
     return sorted(last, key=lambda x: -x.evidence)
 
 
-def distinct(patterns: Float, names: list[str], trust: Float) -> tuple[Float, list[str]]:
-    """Patterns (N, S) without repetitions up to a global sign and 0.5 % of the sites."""
-    keep: list[int] = []
-    for j in range(patterns.shape[1]):
-        if all(abs(np.average(patterns[:, j] * patterns[:, i], weights=trust)) < 0.99 for i in keep):
-            keep.append(j)
-    return patterns[:, keep], [names[j] for j in keep]
+def shortlist(
+    pool: list[tuple[float, Float, gaussian.Smoothness, str]], data: Data, count: int
+) -> list[tuple[float, Float, gaussian.Smoothness, str]]:
+    """The best distinct patterns, from every smoothness in turn: values of different smoothness do not yet compare."""
+    rungs: dict[gaussian.Smoothness, list[tuple[float, Float, gaussian.Smoothness, str]]] = {}
+    for item in pool:
+        rungs.setdefault(item[2], []).append(item)
+    mixed = [row[k] for k in range(max(map(len, rungs.values()))) for row in rungs.values() if k < len(row)]
+    keep = distinct(np.stack([item[1] for item in mixed], 1), data.trust, 0.995)
+    return [mixed[k] for k in keep[:count]]
 
 
 def states(data: Data, g: Float, covariance: Float, noise: float) -> Float:
@@ -188,7 +262,8 @@ def states(data: Data, g: Float, covariance: Float, noise: float) -> Float:
     log = np.empty((len(g), 3))
     for k, sign in enumerate((1.0, -1.0)):
         r = sign * data.d - g
-        log[:, k] = -0.5 * np.einsum("ni,nij,nj->n", r, inverse, r) - 0.5 * logdet - np.log(4 * np.pi) + np.log1p(-OUTLIER)
+        chi2 = np.einsum("ni,nij,nj->n", r, inverse, r)
+        log[:, k] = -0.5 * (chi2 + logdet) - np.log(4 * np.pi) + np.log1p(-OUTLIER)
     log[:, 2] = data.log_outlier + np.log(OUTLIER)
     log -= log.max(1, keepdims=True)
     return np.exp(log) / np.exp(log).sum(1, keepdims=True)

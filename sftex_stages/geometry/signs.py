@@ -24,26 +24,30 @@ DAMPING = 0.6  # share of the new mean in a parallel mean-field step; 1 oscillat
 
 @dataclass(frozen=True)
 class Coupling:
-    """K of the collapsed energy: `pull` (N, 2) = W_i d_i, and its diagonal `own` (N,)."""
+    """K of the collapsed energy: `pull` (N, 2) = W_i d_i, its diagonal `own` (N,), and `log_det` = log det P / det A."""
 
     field: gaussian.Field
     factor: blocks.Factor
     pull: Float
     own: Float
+    log_det: float
 
 
-def coupling(field: gaussian.Field, d: Float, weight: Float, smooth: gaussian.Smoothness) -> Coupling:
-    """The coupling of gradients `d` (N, 2) with precisions `weight` (N, 2, 2)."""
-    factor = gaussian.posterior(field, weight, gaussian.prior(field, smooth))
+def coupling(
+    field: gaussian.Field, d: Float, weight: Float, smooth: gaussian.Smoothness, height: Float | None = None
+) -> Coupling:
+    """The coupling of gradients `d` (N, 2) with precisions `weight` (N, 2, 2), and of heights with precisions (N,)."""
+    factor = gaussian.posterior(field, weight, gaussian.prior(field, smooth), height)
     pull = np.einsum("nij,nj->ni", weight, d)
     variance = gaussian.gradient_covariance(field, factor)
-    return Coupling(field, factor, pull, np.einsum("ni,nij,nj->n", pull, variance, pull))
+    own = np.einsum("ni,nij,nj->n", pull, variance, pull)
+    return Coupling(field, factor, pull, own, gaussian.prior_logdet(field, smooth) - factor.logdet)
 
 
 def surface_of(c: Coupling, m: Float) -> Float:
     """Mean surface coefficients (M, …) for mean signs `m` (N, …)."""
-    data = (m[:, None] * c.pull.reshape(c.pull.shape + (1,) * (m.ndim - 1))).reshape(-1, *m.shape[1:])
-    return blocks.solve(c.factor, c.field.design.T @ data)
+    signed = m[:, None] * c.pull.reshape(c.pull.shape + (1,) * (m.ndim - 1))
+    return blocks.solve(c.factor, gaussian.pulled(c.field, signed))
 
 
 def product(c: Coupling, m: Float) -> Float:
@@ -65,10 +69,10 @@ def spectral_starts(c: Coupling, count: int) -> Float:
     return np.where(vectors < 0, -1.0, 1.0)
 
 
-def anneal(c: Coupling, start: Float, bias: Float, hot: float, steps: int) -> Float:
-    """Mean-field annealing of patterns `start` (N, S) from inverse temperature `hot` to 1; mean signs (N, S)."""
+def anneal(c: Coupling, start: Float, bias: Float, betas: Float) -> Float:
+    """Mean-field annealing of mean signs `start` (N, S) at inverse temperatures `betas`; mean signs (N, S)."""
     m = np.array(start, dtype=float)
-    for beta in np.geomspace(hot, 1.0, steps):
+    for beta in betas:
         local = product(c, m) - c.own[:, None] * m + bias
         m += DAMPING * (np.tanh(beta * local) - m)
     return m

@@ -1,0 +1,264 @@
+"""Stage `frontal`: one texton's frontal appearance and its instances' transforms, one job per cluster (section 3.1)."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from .engine.stage import Arrays, Stage, StageParams
+from .geometry.imaging import normal_of_tensor, singular_values, tensor_of
+from .geometry.metric import common_covariance, metric_covariance, metric_upgrade, project_tensors
+from .geometry.registration import make_template, patch_grid, register, sample
+from .geometry.texton import (
+    PROGRESS,
+    Estimate,
+    Settings,
+    estimate_texton,
+    independent_samples,
+    information_centre,
+    posterior,
+    strain_covariance,
+    tensor_covariance,
+    weighted_contrast,
+    weighted_mean,
+    with_tensor,
+)
+
+Array = NDArray[np.floating]
+
+
+class Params(StageParams):
+    """Parameters of `frontal`."""
+
+    radius: float = Field(4.5, gt=1, le=20, description="radius of the first domain, in sizes (σ) of the interest point")
+    max_growth: float = Field(2.2, ge=1, le=5, description="the domain may grow to this multiple of the first radius")
+    iterations: int = Field(20, ge=5, le=100, description="EM iterations")
+    affine_iterations: int = Field(6, ge=1, le=50, description="of which with free affine frames")
+    subset: int = Field(200, ge=3, description="instances that found the texton; the others are registered to it")
+    agreement: float = Field(0.3, gt=0, lt=1, description="share of unrelated variance below which a pixel is the element's")
+    noise_floor: float = Field(0.01, gt=0, lt=1, description="texton noise that no agreement undercuts, in units of contrast")
+    trend_order: int = Field(1, ge=0, le=2, description="order of the polynomial trend of log scale (perspective)")
+    max_metric_residual: float = Field(0.03, gt=0, description="a texton above is unusable")
+    max_sigma: float = Field(8.0, gt=0, description="a texton whose typical normal error is larger (degrees) is unusable")
+
+
+_MEMO: dict[str, Any] = {}
+
+
+def level_image(rgb: Array, level: int) -> Array:
+    """`rgb` at pyramid level: −1 doubled, 0 as it is, 1 halved, … (x_level = (x + ½) 2^−level − ½)."""
+    if _MEMO.get("rgb") is not rgb:
+        _MEMO.clear()
+        _MEMO["rgb"] = rgb
+    if level not in _MEMO:
+        if level == 0:
+            _MEMO[level] = np.ascontiguousarray(rgb, np.float32)
+        elif level < 0:
+            _MEMO[level] = cv2.resize(rgb, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        else:
+            above = level_image(rgb, level - 1)
+            size = (max(1, (above.shape[1] + 1) // 2), max(1, (above.shape[0] + 1) // 2))
+            _MEMO[level] = cv2.resize(above, size, interpolation=cv2.INTER_AREA)
+    return _MEMO[level]
+
+
+def empty(reason: str) -> Arrays:
+    """The artefact of a texton that could not be estimated."""
+    none = np.zeros((0,), np.float32)
+    return {
+        "usable": np.bool_(False),
+        "reason": np.str_(reason),
+        "appearance": np.zeros((0, 0, 3), np.float32),
+        "domain": np.zeros((0, 0), np.float32),
+        "spacing": np.float32(0),
+        "progress": np.zeros((0, 0, 0, 3), np.float32),
+        "progress_iterations": np.zeros(0, np.int32),
+        "metric_residual": np.float32(np.nan),
+        "information": np.float32(0),
+        "index": np.zeros(0, np.int32),
+        "xy": np.zeros((0, 2), np.float32),
+        "transform": np.zeros((0, 2, 2), np.float32),
+        "scale": none,
+        "tensor": np.zeros((0, 3), np.float32),
+        "tensor_cov": np.zeros((0, 3, 3), np.float32),
+        "log_scale_sigma": none,
+        "normal": np.zeros((0, 3), np.float32),
+        "normal_sigma": none,
+        "inlier": none,
+        "irradiance": none,
+        "irradiance_sigma": none,
+    }
+
+
+def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
+    """Estimate the texton of one cluster. Inputs `image`, `detect`, `cluster`, `part`."""
+    rgb, detect = inputs["image"]["rgb"], inputs["detect"]
+    members = np.flatnonzero(inputs["cluster"]["label"] == int(inputs["part"]))
+    if len(members) < 3:
+        return empty(f"only {len(members)} instances; three are the least that fix a frontal view")
+    xy0, frames0 = detect["xy"][members].astype(np.float64), detect["frame"][members].astype(np.float64)
+
+    # one grid point is about one pixel of the pyramid level on which the first domain is 8 to 13 points in radius
+    size = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0))))) * params.radius
+    level = int(np.clip(np.ceil(np.log2(size / 9.0)), -1, 5))
+    image = level_image(rgb, level)
+    factor = 2.0**-level
+    half = int(np.clip(round(size * factor), 6, 9))
+    xy = (xy0 + 0.5) * factor - 0.5
+    frames = frames0 * (params.radius * factor / half)
+    extent = np.array([rgb.shape[1], rgb.shape[0]], float)
+    where0 = (2 * xy0 - extent) / extent.max()
+
+    rng = np.random.default_rng(0)
+    few = np.sort(rng.permutation(len(members))[: params.subset])
+    settings = Settings(
+        half=half,
+        half_limit=int(round(half * params.max_growth)),
+        iterations=params.iterations,
+        affine_iterations=min(params.affine_iterations, params.iterations),
+        noise_floor=params.noise_floor,
+        trend_order=params.trend_order,
+        agreement=params.agreement,
+    )
+    texton = estimate_texton(image, xy[few], frames[few], where0[few], settings)
+    if texton is None:
+        return empty("no three of its patches look alike")
+    return finish(image, texton, xy, frames, where0, members, few, factor, params)
+
+
+def finish(
+    image: Array, texton: Estimate, xy: Array, frames: Array, where: Array, members: Array, few: Array, factor: float, params: Params
+) -> Arrays:
+    """Register all members to the finished texton and report them with their uncertainties."""
+    template = texton.template
+    start_xy, start_frames = xy.copy(), frames.copy()
+    if len(few) < len(members):
+        # detector frames differ from the texton's by one common map: learn it from the founders
+        good = texton.inlier > 0.8
+        if good.sum() >= 3:
+            relative = np.linalg.solve(frames[few][good], texton.frames[good])
+            common = np.median(relative, axis=0)
+            shift = np.median(np.linalg.solve(frames[few][good], (texton.xy[good] - xy[few][good])[..., None])[..., 0], axis=0)
+            start_frames = frames @ common
+            start_xy = xy + np.einsum("mij,j->mi", frames, shift)
+    start_xy[few], start_frames[few] = texton.xy, texton.frames
+    got = register(image, template, start_xy, start_frames, steps=10)
+    residual = got.residual
+    contrast2 = weighted_contrast(template)
+    samples = independent_samples(template)
+    inlier = posterior(residual, texton.noise**2, contrast2, texton.prior, samples)
+    if inlier.sum() < 2.5:
+        return empty("its patches do not agree with their mean")
+    order = params.trend_order if inlier.sum() >= 12 else 0
+    upgrade = metric_upgrade(got.frames, where, inlier + 1e-6, order)
+    frames_ = got.frames @ np.linalg.cholesky(upgrade.gram)
+    scale = np.exp(upgrade.log_scale)
+    tensor = tensor_of(frames_, scale)
+    own = tensor_covariance(frames_, scale, strain_covariance(template, residual))
+    _, _, chi2 = project_tensors(tensor, own)
+    good = inlier > 0.5
+    # the model's own distance from the manifold sets the unit of every covariance
+    unit = float(max(np.median(chi2[good]) / 0.455, 1.0)) if good.sum() >= 5 else 10.0
+    chi2 = chi2 / unit
+    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual)
+    common = common_covariance(frames_, where, scale, order, metric_cov)
+    cov = own * unit + common
+    projected, left, _ = project_tensors(tensor, cov)
+    inlier = inlier * np.where(chi2 < 12.0, 1.0, np.exp(-0.5 * (chi2 - 12.0)))
+    transform = with_tensor(frames_, projected, scale)
+    normal = normal_of_tensor(projected)
+    sigma = normal_sigma(normal, left)
+    centre = got.xy + transform @ information_centre(template)
+    inlier = inlier * unique(got.xy, residual, transform, template)
+    good = inlier > 0.8
+    reason = ""
+    typical = float(np.median(sigma[good])) if good.any() else np.inf
+    if good.sum() < 3:
+        reason = f"only {int(good.sum())} instances agree with it"
+    elif upgrade.residual > params.max_metric_residual:
+        reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
+    elif typical > params.max_sigma:
+        reason = f"it says too little about slant and tilt (expected error {typical:.1f} degrees)"
+    out_scale = scale
+    return {
+        "usable": np.bool_(reason == ""),
+        "reason": np.str_(reason),
+        "appearance": texton.values.astype(np.float32),
+        "domain": texton.weights.astype(np.float32),
+        "spacing": np.float32(1.0 / factor),
+        "progress": progress(image, texton),
+        "progress_iterations": np.array([h[0] for h in texton.history], np.int32),
+        "metric_residual": np.float32(upgrade.residual),
+        "information": np.float32(np.sqrt(np.trace(metric_cov[:3, :3]))),
+        "index": members.astype(np.int32),
+        "xy": ((centre + 0.5) / factor - 0.5).astype(np.float32),
+        "transform": transform.astype(np.float32),
+        "scale": out_scale.astype(np.float32),
+        "tensor": tensor.astype(np.float32),
+        "tensor_cov": cov.astype(np.float32),
+        "log_scale_sigma": np.sqrt(cov[:, [0, 2], [0, 2]].mean(1) / 4).astype(np.float32),
+        "normal": normal.astype(np.float32),
+        "normal_sigma": sigma.astype(np.float32),
+        "inlier": inlier.astype(np.float32),
+        "irradiance": got.gain.astype(np.float32),
+        "irradiance_sigma": np.sqrt(residual / max(float((template.values**2).mean()), 1e-12) / samples).astype(np.float32),
+       
+    }
+
+
+def normal_sigma(normal: Array, cov: Array) -> Array:
+    """Expected error in degrees (M,) of normals (M, 3) from the covariance of their tensors.
+
+    Along the tilt the tensor moves with 2 sin σ cos σ, across it with sin² σ: near σ = 0 both vanish, and the error is
+    the square root of the tensor's.
+    """
+    sine = np.hypot(normal[:, 0], normal[:, 1])
+    u = normal[:, :2] / np.maximum(sine, 1e-9)[:, None]
+    along = np.stack([u[:, 0] ** 2, 2 * u[:, 0] * u[:, 1], u[:, 1] ** 2], -1)
+    across = np.stack([-u[:, 0] * u[:, 1], u[:, 0] ** 2 - u[:, 1] ** 2, u[:, 0] * u[:, 1]], -1)
+    va = np.einsum("mi,mij,mj->m", along, cov, along)
+    vc = np.einsum("mi,mij,mj->m", across, cov, across)
+    cos = np.maximum(normal[:, 2], 0.1)
+    slant = np.sqrt(va) / (2 * cos * np.sqrt(sine**2 + 0.5 * np.sqrt(va)))
+    tilt = np.sqrt(vc) / np.sqrt(sine**2 + np.sqrt(vc))
+    return np.degrees(np.hypot(slant, tilt))
+
+
+def unique(xy: Array, residual: Array, transform: Array, template: Any) -> Array:
+    """1 for instances to keep, 0 for those that have slid onto a better registered one (M,)."""
+    order = np.argsort(residual)
+    keep = np.zeros(len(xy))
+    used = template.weights > 0.3 * template.weights.max()
+    radius = np.sqrt(used.sum() / np.pi)
+    size = np.sqrt(np.abs(np.linalg.det(transform))) * radius
+    taken: list[int] = []
+    for i in order:
+        if taken:
+            d = np.linalg.norm(xy[taken] - xy[i], axis=1)
+            if (d < 0.25 * size[i]).any():
+                continue
+        taken.append(int(i))
+        keep[i] = 1.0
+    return keep
+
+
+def progress(image: Array, texton: Estimate) -> Array:
+    """The frontal appearance after each iteration in the history, on the final grid and gauge: (k, n, n, 3)."""
+    n = 2 * texton.half + 1
+    pictures = []
+    for _, xy, frames, inlier in texton.history:
+        # the gauge of that iteration against the final one: a common map, by least squares over the founders
+        weight = texton.inlier[:, None, None]
+        a = np.einsum("mji,mjk->ik", frames * weight, frames)
+        b = np.einsum("mji,mjk->ik", frames * weight, texton.frames)
+        patches = sample(image, xy, frames @ np.linalg.solve(a, b), patch_grid(texton.half, 1.0))
+        gain = np.maximum(patches.mean((1, 2)), 1e-6)
+        mean, _ = weighted_mean(patches, gain / np.median(gain), inlier + 1e-9)
+        pictures.append(mean.reshape(n, n, -1))
+    return np.stack(pictures).astype(np.float32)
+
+
+STAGE = Stage(name="frontal", version=1, params=Params, run=run, inputs=("image", "detect", "cluster"), fan_out="cluster")

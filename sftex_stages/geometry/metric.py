@@ -1,0 +1,204 @@
+"""The metric upgrade: from affine registrations to texture imaging transforms.
+
+Registration gives frames G_i known up to one common affine map A. By Lemma 4 of the paper three generic instances
+fix A up to rotation and flip: every G_i A must have its larger singular value equal to the local scale s_i. Only
+M = A Aᵀ enters, because G_i M G_iᵀ = s_i² (I − n_xy n_xyᵀ).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+_TREND_SIGMA = 0.1  # prior of each coefficient of log s over the image: a tenth is a strong perspective
+
+
+class Upgrade(NamedTuple):
+    """Result of `metric_upgrade`."""
+
+    gram: Array  # (2, 2) M = A Aᵀ
+    trend: Array  # (5,) coefficients of log s over (x, y, x², xy, y²)
+    log_scale: Array  # (N,) log s at the instances
+    residual: float  # robust standard deviation of log σ_max − log s over instances that inform it
+
+
+def trend_basis(where: Array, order: int = 2) -> Array:
+    """Columns x, y, x², xy, y² of normalised positions (N, 2) in [−1, 1]: (N, 5); order 0 or 1 zeroes the rest."""
+    x, y = where[:, 0], where[:, 1]
+    columns = np.stack([x, y, x * x, x * y, y * y], -1)
+    if order < 2:
+        columns[:, 2:] = 0.0
+    if order < 1:
+        columns[:] = 0.0
+    return columns
+
+
+def leading_eigenpair(tensors: Array) -> tuple[Array, Array, Array]:
+    """(λ1, λ2, unit eigenvector of λ1) of symmetric (N, 2, 2) matrices, λ1 ≥ λ2."""
+    xx, xy, yy = tensors[:, 0, 0], tensors[:, 0, 1], tensors[:, 1, 1]
+    mean, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    return mean + half, mean - half, np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+def linear_start(frames: Array, weights: Array) -> Array | None:
+    """M from det(G)² d − tr(G M Gᵀ) + 1 = 0, linear in (M, d = det M) (Lemma 1); None if it is not positive.
+
+    Needs four instances or more; `frames` (N, 2, 2) must be scaled so that M is near the identity.
+    """
+    g = frames
+    det2 = np.linalg.det(g) ** 2
+    gtg = np.swapaxes(g, -1, -2) @ g
+    rows = np.stack([gtg[:, 0, 0], 2 * gtg[:, 0, 1], gtg[:, 1, 1], -det2], -1)
+    root = np.sqrt(weights)[:, None]
+    if len(g) < 4:
+        return None
+    solution = np.linalg.lstsq(rows * root, root[:, 0], rcond=None)[0]
+    gram = np.array([[solution[0], solution[1]], [solution[1], solution[2]]])
+    return gram if np.linalg.eigvalsh(gram)[0] > 1e-3 else None
+
+
+def metric_upgrade(
+    frames: Array, where: Array, weights: Array, order: int = 1, steps: int = 30, warm: bool = False
+) -> Upgrade:
+    """Find M and the trend of log s so that the larger singular value of every G_i A is s_i.
+
+    Robust Gauss–Newton on log σ_max(G_i A) − log s(x_i) in the three entries of M and the trend; s is 1 at the centre
+    of `where` (N, 2) in [−1, 1]. Instances that are nearly frontal count little: there the larger of two equal and
+    noisy singular values is biased upward. Several starts, and the lowest robust cost wins; `warm` says that the frames
+    are nearly metric already.
+    """
+    base = float(np.exp(np.median(np.log(np.linalg.svd(frames, compute_uv=False)[:, 0]))))
+    g = frames / base
+    starts = [np.eye(2)]
+    if not warm:
+        start = linear_start(g, weights)
+        if start is not None:
+            starts.append(start)
+        spread = np.swapaxes(g, -1, -2) @ g
+        starts.append(np.linalg.inv(np.einsum("n,nij->ij", weights, spread) / weights.sum()))
+    best: tuple[float, Array, Array, Array] | None = None
+    basis = trend_basis(where, order)
+    for gram in starts:
+        solved = _refine(g, basis, weights, gram, steps)
+        if best is None or solved[0] < best[0]:
+            best = solved
+    assert best is not None
+    _, gram, trend, residuals = best
+    spread_ = _weighted_mad(residuals, weights * _informs(g, gram))
+    return Upgrade(gram / base**2, trend, basis @ trend, spread_)
+
+
+def _informs(g: Array, gram: Array) -> Array:
+    """Weight in [0, 1] of an instance: its anisotropy against the level where σ_max is biased by noise."""
+    l1, l2, _ = leading_eigenpair(g @ gram @ np.swapaxes(g, -1, -2))
+    kappa = 1 - np.clip(l2, 0, None) / np.maximum(l1, 1e-12)
+    return kappa**2 / (kappa**2 + 0.15**2) + 0.02
+
+
+def _weighted_mad(values: Array, weights: Array) -> float:
+    order = np.argsort(np.abs(values))
+    cumulative = np.cumsum(weights[order])
+    return float(1.4826 * np.abs(values)[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+def _refine(g: Array, basis: Array, weights: Array, gram: Array, steps: int) -> tuple[float, Array, Array, Array]:
+    trend = np.zeros(basis.shape[1])
+    prior = np.concatenate([np.full(3, 1e-6), np.full(len(trend), 1.0)])
+
+    def residual(gram: Array, trend: Array) -> tuple[Array, Array, Array]:
+        l1, _, u = leading_eigenpair(g @ gram @ np.swapaxes(g, -1, -2))
+        l1 = np.maximum(l1, 1e-9)
+        v = np.einsum("nji,nj->ni", g, u)
+        jac = np.stack([v[:, 0] ** 2, 2 * v[:, 0] * v[:, 1], v[:, 1] ** 2], -1) / (2 * l1[:, None])
+        return 0.5 * np.log(l1) - basis @ trend, jac, l1
+
+    def cost(r: Array, w: Array, scale: float, trend: Array) -> float:
+        return float((w * np.log1p((r / scale) ** 2)).sum() / w.sum())
+
+    r, jac, _ = residual(gram, trend)
+    w = weights * _informs(g, gram)
+    for _ in range(steps):
+        w = weights * _informs(g, gram)
+        scale = max(_weighted_mad(r, w), 3e-3)
+        robust = w / (1 + (r / (2 * scale)) ** 2)
+        full = np.concatenate([jac, -basis], 1)
+        normal = full.T @ (robust[:, None] * full) / scale**2
+        normal[np.diag_indices(len(prior))] += prior * np.r_[np.full(3, 1.0), np.full(len(trend), 1 / _TREND_SIGMA**2)]
+        grad = full.T @ (robust * r) / scale**2
+        grad[3:] += trend / _TREND_SIGMA**2
+        step = -np.linalg.solve(normal, grad)
+        here = cost(r, w, 2 * scale, trend)
+        for fraction in (1.0, 0.5, 0.25, 0.1):
+            new_gram = gram + fraction * np.array([[step[0], step[1]], [step[1], step[2]]])
+            if np.linalg.eigvalsh(new_gram)[0] < 0.02:
+                continue
+            new_trend = trend + fraction * step[3:]
+            new_r, new_jac, _ = residual(new_gram, new_trend)
+            if cost(new_r, w, 2 * scale, new_trend) < here + 1e-9:
+                gram, trend, r, jac = new_gram, new_trend, new_r, new_jac
+                break
+        else:
+            break
+        if np.abs(step).max() * fraction < 1e-6:
+            break
+    # starts are compared on one robust scale: the log of their own spread
+    return float(np.log(max(_weighted_mad(r, w), 1e-4))), gram, trend, r
+
+
+def metric_covariance(frames: Array, where: Array, weights: Array, order: int, residual: float) -> Array:
+    """Covariance (8, 8) of (M11, M12, M22, trend) around M = I, for frames (N, 2, 2) that are metric already.
+
+    `residual` is the standard deviation of one instance's log σ_max. Where all instances keep nearly the same direction of
+    the element (section 2.2.2) it is large, and says along which stretch of the element.
+    """
+    l1, l2, u = leading_eigenpair(frames @ np.swapaxes(frames, -1, -2))
+    v = np.einsum("nji,nj->ni", frames, u) / np.sqrt(np.maximum(l1, 1e-9))[:, None]
+    full = np.concatenate([np.stack([v[:, 0] ** 2, 2 * v[:, 0] * v[:, 1], v[:, 1] ** 2], -1) / 2, -trend_basis(where, order)], 1)
+    w = weights * _informs(frames, np.eye(2))
+    effective = w.sum() ** 2 / max((w**2).sum(), 1e-12)
+    variance = max(residual, 2e-3) ** 2 * effective / max(effective - 3, 0.5)
+    normal = full.T @ (w[:, None] * full) / variance + np.diag(np.r_[np.full(3, 1.0), np.full(5, 1 / _TREND_SIGMA**2)])
+    return np.linalg.inv(normal)
+
+
+def common_covariance(frames: Array, where: Array, scale: Array, order: int, cov: Array) -> Array:
+    """What an uncertain M and trend add to the covariances (N, 3, 3) of G M Gᵀ/s²; frames metric, `cov` (8, 8)."""
+    g = frames / scale[:, None, None]
+    tensor = np.stack([(g[:, 0] ** 2).sum(-1), (g[:, 0] * g[:, 1]).sum(-1), (g[:, 1] ** 2).sum(-1)], -1)
+    jac = np.concatenate([gram_lift(g), -2 * tensor[:, :, None] * trend_basis(where, order)[:, None, :]], 2)
+    return jac @ cov @ np.swapaxes(jac, 1, 2)
+
+
+def gram_lift(g: Array) -> Array:
+    """(N, 3, 3) matrices that take (e1, e2, e3) of a symmetric E to (xx, xy, yy) of G E Gᵀ."""
+    a, b, c, d = g[:, 0, 0], g[:, 0, 1], g[:, 1, 0], g[:, 1, 1]
+    rows = [
+        np.stack([a * a, 2 * a * b, b * b], -1),
+        np.stack([a * c, a * d + b * c, b * d], -1),
+        np.stack([c * c, 2 * c * d, d * d], -1),
+    ]
+    return np.stack(rows, 1)
+
+
+def project_tensors(tensor: Array, cov: Array, steps: int = 4) -> tuple[Array, Array, Array]:
+    """Nearest tensors with larger eigenvalue 1, in the metric of their covariance.
+
+    `tensor` (N, 3) holds (xx, xy, yy) of G M Gᵀ/s², `cov` (N, 3, 3) its covariance. Returns the projected tensors, the
+    covariance left on the constraint, and chi² (N,) with one degree of freedom, of the distance: a patch that is no
+    view of the texton shows there.
+    """
+    out = tensor.copy()
+    for _ in range(steps):
+        mat = np.stack([out[:, 0], out[:, 1], out[:, 1], out[:, 2]], -1).reshape(-1, 2, 2)
+        _, _, u = leading_eigenpair(mat)
+        grad = np.stack([u[:, 0] ** 2, 2 * u[:, 0] * u[:, 1], u[:, 1] ** 2], -1)
+        # the constraint linearised at `out`: λ1(out) + grad·(new − out) = 1, and λ1(out) = grad·out
+        gap = (grad * tensor).sum(1) - 1.0
+        lever = np.einsum("nij,nj->ni", cov, grad)
+        spread = np.maximum((grad * lever).sum(1), 1e-12)
+        out = tensor - lever * (gap / spread)[:, None]
+    left = cov - lever[:, :, None] * lever[:, None, :] / spread[:, None, None]
+    return out, left, gap**2 / spread

@@ -1,0 +1,248 @@
+"""EM for one texton: appearance, texture imaging transforms, irradiance and inliers (paper, section 3.1).
+
+All lengths are pixels of one image (a pyramid level chosen by the caller). The steps: congeal the patches with free
+affine frames, upgrade the frames to metric (Lemma 4), then EM with every frame held to the manifold s R F R, while the
+domain grows to where the patches agree.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .imaging import tensor_of
+from .metric import gram_lift, leading_eigenpair, metric_upgrade, project_tensors
+from .registration import Template, compose_step, make_template, marginal_hessian, patch_grid, registration_step, sample
+
+Array = NDArray[np.floating]
+
+PROGRESS = (1, 5, 10, 20)  # EM iterations whose frontal estimate is kept (the paper's Fig. 4)
+
+
+class Settings(NamedTuple):
+    """What the caller decides; lengths in grid points."""
+
+    half: int  # half width of the first domain
+    half_limit: int  # half width to which the domain may grow
+    iterations: int  # EM iterations
+    affine_iterations: int  # of which with free affine frames
+    noise_floor: float  # standard deviation of a texton pixel that no agreement can undercut, in units of contrast
+    trend_order: int  # order of the trend of log s
+    agreement: float  # share of the unrelated variance below which a pixel belongs to the element
+
+
+class Estimate(NamedTuple):
+    """A texton and the instances it was estimated from."""
+
+    template: Template
+    values: Array  # (n, n, C) µ
+    weights: Array  # (n, n)
+    half: int
+    xy: Array  # (M, 2)
+    frames: Array  # (M, 2, 2)
+    inlier: Array  # (M,) posterior of δ_i
+    noise: float  # σ: root of the weighted residual variance of inliers
+    prior: float  # mixing weight of the inliers
+    history: list[tuple[int, Array, Array, Array]]  # (iteration, xy, frames, inlier)
+
+
+def centre_window(half: int) -> Array:
+    """Soft round window (n, n): 1 at the centre, 0 outside the inscribed circle."""
+    axis = np.arange(-half, half + 1) / (half + 0.5)
+    r2 = axis[:, None] ** 2 + axis[None, :] ** 2
+    return np.where(r2 < 1, np.exp(-1.5 * r2), 0.0)
+
+
+def seed_members(patches: Array, window: Array) -> Array:
+    """Weights (M,) of the members of the largest group of mutually similar patches (M, P, C).
+
+    Similarity is zero-mean normalised correlation over the window; the seed is the patch that has the most good
+    neighbours, and the members near it found the first template: a cluster that mixes elements starts from one.
+    """
+    w = window.ravel()[None, :, None]
+    mean = (patches * w).sum(1, keepdims=True) / w.sum()
+    flat = ((patches - mean) * np.sqrt(w)).reshape(len(patches), -1)
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+    similar = flat @ flat.T
+    score = np.sort(similar, axis=1)[:, -max(3, len(patches) // 3) :].mean(1)
+    near = similar[int(score.argmax())]
+    cut = np.sort(near)[-max(3, int(0.6 * len(near)))]
+    return np.where(near >= max(cut, 0.5), np.clip(near, 0.0, 1.0) ** 4, 0.0)
+
+
+def weighted_mean(patches: Array, gain: Array, weights: Array) -> tuple[Array, Array]:
+    """Mean and variance over instances of the patches divided by their gain: (P, C), (P,)."""
+    share = weights / weights.sum()
+    lit = patches / gain[:, None, None]
+    mean = np.einsum("m,mpc->pc", share, lit)
+    effective = 1 / (share**2).sum()
+    var = np.einsum("m,mpc->p", share, (lit - mean) ** 2) / lit.shape[2] * effective / max(effective - 1, 0.5)
+    return mean, var
+
+
+def posterior(residual: Array, noise2: float, contrast2: float, prior: float, samples: float) -> Array:
+    """E[δ_i] for mean squared residuals (M,): inliers have variance noise2, others contrast2, `samples` independent."""
+    spread = max(contrast2, 2 * noise2)
+    log_odds = 0.5 * samples * (np.log(spread / noise2) - residual * (1 / noise2 - 1 / spread))
+    return 1 / (1 + np.exp(-np.clip(log_odds + np.log(prior / (1 - prior)), -500, 500)))
+
+
+def domain_weights(values: Array, var: Array, half: int, floor: float, agreement: float) -> Array:
+    """Inverse-variance weights (n, n) of the texton's pixels.
+
+    A pixel belongs to the element while its variance across instances is below `agreement` × the variance that
+    unrelated pixels have; only the part connected with the centre counts. Weights are 1 at best.
+    """
+    n = 2 * half + 1
+    window = (centre_window(half) > 0).ravel()
+    inner = centre_window(half).ravel()
+    share = inner / inner.sum()
+    contrast2 = float(((values - share @ values) ** 2 * share[:, None]).sum() / values.shape[1])
+    base = max(floor**2 * contrast2, 1e-10)
+    image = cv2.GaussianBlur(var.reshape(n, n).astype(np.float32), (0, 0), 0.8).ravel()
+    agree = window & (image < agreement * max(contrast2, base))
+    mask = agree.reshape(n, n).astype(np.uint8)
+    count, labels = cv2.connectedComponents(mask, connectivity=4)
+    core = slice(half - max(1, half // 4), half + max(1, half // 4) + 1)
+    touching = np.unique(labels[core, core])
+    keep = np.isin(labels, touching[touching > 0]).ravel()
+    weights = np.where(keep, base / (base + image), 0.0)
+    return weights.reshape(n, n)
+
+
+def grow(values: Array, var: Array, half: int, agreement: float, contrast2: float) -> bool:
+    """Whether the outermost ring of the domain still agrees in a fair part, so that a larger domain is worth trying."""
+    n = 2 * half + 1
+    axis = np.arange(-half, half + 1) / half
+    r = np.sqrt(axis[:, None] ** 2 + axis[None, :] ** 2).ravel()
+    ring = (r <= 1) & (r > 0.75)
+    # a flat ring agrees always and tells nothing: it must carry some of the contrast
+    flat = values.reshape(n * n, -1)
+    busy = ((flat[ring] - flat[ring].mean(0)) ** 2).mean() > 0.02 * contrast2
+    return bool((var[ring] < agreement * contrast2).mean() > 0.25 and busy)
+
+
+def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settings: Settings) -> Estimate | None:
+    """EM of section 3.1 on the members of one cluster.
+
+    `image` (H, W, C) linear; `xy` (M, 2), `frames` (M, 2, 2): detector frames in pixels of `image`, one grid point a
+    unit; `where` (M, 2) positions in [−1, 1]. None when no group of three similar patches exists.
+    """
+    half = settings.half
+    n = 2 * half + 1
+    window = centre_window(half)
+    patches = sample(image, xy, frames, patch_grid(half, 1.0))
+    inlier = seed_members(patches, window)
+    if (inlier > 0).sum() < 3:
+        return None
+    gain = np.maximum(np.einsum("mpc,p->m", patches, window.ravel()) / window.sum(), 1e-6)
+    gain /= np.median(gain[inlier > 0])
+    values, var = weighted_mean(patches, gain, inlier)
+    weights, noise2, prior, contrast2 = window, 0.0, 0.7, 1.0
+    history: list[tuple[int, Array, Array, Array]] = []
+    scale = np.ones(len(xy))
+    last_growth, held = 0, False
+    for iteration in range(1, settings.iterations + 1):
+        template = make_template(values.reshape(n, n, -1), weights, 1.0)
+        contrast2 = weighted_contrast(template)
+        # M-step for the transforms and gains, E-step for δ, all from the patches in hand
+        step, gain, residual = registration_step(template, patches, _DAMPING)
+        if iteration == 1:
+            noise2 = float(np.median(residual[inlier > 0.3]))
+        samples = independent_samples(template)
+        for _ in range(3):
+            inlier = posterior(residual, noise2, contrast2, prior, samples)
+            noise2 = float(max((inlier * residual).sum() / max(inlier.sum(), 1e-6), settings.noise_floor**2 * contrast2, 1e-12))
+            prior = float(np.clip(inlier.mean(), 0.05, 0.98))
+        if inlier.sum() < 2.5:
+            return None
+        xy, frames = compose_step(xy, frames, step)
+        if iteration >= settings.affine_iterations:
+            upgrade = metric_upgrade(frames, where, inlier + 1e-6, settings.trend_order if len(xy) >= 12 else 0, warm=held)
+            held = True
+            frames, scale = frames @ np.linalg.cholesky(upgrade.gram), np.exp(upgrade.log_scale)
+            frames = hold_to_manifold(frames, scale, template, residual)
+            # the normal that an element tells is the one where its detail lies, not where the detector put its point
+            xy = xy + frames @ information_centre(template)
+            if iteration - last_growth >= 2 and half < settings.half_limit:
+                if grow(values, var, half, settings.agreement, contrast2):
+                    half, last_growth = min(settings.half_limit, int(np.ceil(half * 1.3))), iteration
+                    n = 2 * half + 1
+        if iteration in PROGRESS:
+            history.append((iteration, xy, frames, inlier))
+        # M-step for the appearance
+        patches = sample(image, xy, frames, patch_grid(half, 1.0))
+        gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
+        values, var = weighted_mean(patches, gain, inlier * _sharpness(frames))
+        weights = domain_weights(values, var, half, 0.1, settings.agreement)
+        if (weights > 0).sum() < 9:
+            return None
+    template = make_template(values.reshape(n, n, -1), weights, 1.0)
+    return Estimate(template, values.reshape(n, n, -1), weights, half, xy, frames, inlier, float(np.sqrt(noise2)), prior, history)
+
+
+_DAMPING = 1e-3
+
+
+def information_centre(template: Template) -> Array:
+    """Centre (2,) of the detail that fixes the transform: mean position weighted by w |∇µ|²."""
+    power = (template.basis[:, 5:] ** 2).sum(1).reshape(len(template.points), -1).sum(1)
+    return power @ template.points / max(power.sum(), 1e-30)
+
+
+def independent_samples(template: Template) -> float:
+    """Number of independent residuals that a patch is judged by: neighbouring grid points share the image's blur."""
+    return float(np.clip((template.weights > 0.02 * template.weights.max()).sum() / 8, 6, 40))
+
+
+def weighted_contrast(template: Template) -> float:
+    """Variance of µ over its domain, mean of the channels."""
+    share = template.weights / template.weights.sum()
+    mean = share @ template.values
+    return float(((template.values - mean) ** 2 * share[:, None]).sum() / template.values.shape[1])
+
+
+def _sharpness(frames: Array) -> Array:
+    """Steep instances show less detail: weight by cos σ."""
+    sigma = np.linalg.svd(frames, compute_uv=False)
+    return sigma[:, 1] / np.maximum(sigma[:, 0], 1e-9)
+
+
+def strain_covariance(template: Template, residual: Array) -> Array:
+    """Covariance (M, 3, 3) of the symmetric strain (2 d11, d12 + d21, 2 d22) of a registration, up to one factor.
+
+    From the information of the template (its Hessian with gain and translation marginalised) and each instance's mean
+    squared `residual` (M,). Neighbouring samples are not independent, and models are never exact: `calibrate` finds the factor.
+    """
+    hessian = marginal_hessian(template)
+    ridge = 1e-6 * np.trace(hessian[:4, :4])
+    cov = np.linalg.inv(hessian + ridge * np.eye(6))[:4, :4]
+    fold = np.array([[2.0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 2]])
+    return residual[:, None, None] * (fold @ cov @ fold.T)
+
+
+def tensor_covariance(frames: Array, scale: Array, strain: Array) -> Array:
+    """Covariance (M, 3, 3) of (xx, xy, yy) of G Gᵀ/s² from that of the strain."""
+    g = frames / scale[:, None, None]
+    lift = gram_lift(g)
+    return lift @ strain @ np.swapaxes(lift, 1, 2) + 1e-8 * np.eye(3)
+
+
+def hold_to_manifold(frames: Array, scale: Array, template: Template, residual: Array) -> Array:
+    """Frames (M, 2, 2) moved to the nearest s R F R in the metric of their own information."""
+    cov = tensor_covariance(frames, scale, strain_covariance(template, residual))
+    projected, _, _ = project_tensors(tensor_of(frames, scale), cov)
+    return with_tensor(frames, projected, scale)
+
+
+def with_tensor(frames: Array, tensor: Array, scale: Array) -> Array:
+    """The matrices nearest in rotation to `frames` whose T Tᵀ is s² `tensor`, the tensor clipped to valid slants."""
+    mat = np.stack([tensor[:, 0], tensor[:, 1], tensor[:, 1], tensor[:, 2]], -1).reshape(-1, 2, 2)
+    l1, l2, u = leading_eigenpair(mat)
+    v = np.stack([-u[:, 1], u[:, 0]], -1)
+    minor = np.sqrt(np.clip(l2, 0.01, 1.0))
+    root = u[:, :, None] * u[:, None, :] + minor[:, None, None] * v[:, :, None] * v[:, None, :]
+    p, _, qt = np.linalg.svd(root @ frames)
+    turn = p @ qt
+    return scale[:, None, None] * (root @ turn)
