@@ -9,6 +9,9 @@ from .figures import FIGURES, Numbers, Target, original, targets
 
 _MARKS = {"pass": " ✓", "floor": " ~", "miss": " ✗", "none": " ✗"}
 _TABLES = {
+    "Summary": ["accepted", "instance_median", "instance_p90", "recall", "signs", "dense_median", "dense_11",
+                "coverage", "height", "light", "light_gain", "constant_baseline", "seconds", "cached_seconds",
+                "peak_memory"],
     "Instances": ["accepted", "usable_textons", "textons", "instance_median", "instance_p90", "recall",
                   "instance_signs", "instance_signs_given", "instance_light", "instance_light_pooled",
                   "instance_ratio", "instance_beyond_3"],
@@ -17,7 +20,8 @@ _TABLES = {
                 "height_scaled", "pixel_ratio", "pixel_beyond_3", "pixel_factor", "frontal_baseline",
                 "constant_baseline"],
     "Irradiance": ["light", "light_correlation", "light_gain", "light_blurred", "light_constant"],
-    "Cost": ["seconds", "cached_seconds", "keypoints", "frontal_ms", "frontal_memory", "irradiance_seconds"],
+    "Cost": ["seconds", "cached_seconds", "keypoints", "frontal_ms", "frontal_memory", "peak_memory",
+             "irradiance_seconds"],
 }  # fmt: skip
 _NOISE = {"s": 0.25, "ms": 0.25, "MB": 0.1}  # relative change of a cost that means nothing
 _STILL = 0.02  # relative change of any other figure that is not worth a line

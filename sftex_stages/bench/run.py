@@ -131,7 +131,7 @@ def costs(result: Path, store: Path) -> dict[str, Any]:
     """What a result cost, from the receipts of the jobs that made it.
 
     stages: per stage its jobs, `seconds` of all together, `wall` from the first start to the last end, `peak_memory_mb`
-    of the worst; the figures `keypoints`, `textons`, `usable_textons`, `frontal_ms`, `frontal_memory`,
+    of the worst. The figures `keypoints`, `textons`, `usable_textons`, `frontal_ms`, `frontal_memory`, `peak_memory`,
     `irradiance_seconds`.
     """
     with h5py.File(result, "r", locking=False) as file:
@@ -152,6 +152,7 @@ def costs(result: Path, store: Path) -> dict[str, Any]:
     if "frontal" in stages:
         out["frontal_ms"] = 1000 * stages["frontal"]["seconds"] / max(out["keypoints"], 1)
         out["frontal_memory"] = stages["frontal"]["peak_memory_mb"]
+    out["peak_memory"] = max(cost["peak_memory_mb"] for cost in stages.values())
     out["irradiance_seconds"] = stages["irradiance"]["seconds"]
     return out
 
