@@ -1,7 +1,7 @@
 """The command line: ``sftex run | status | evaluate | config``.
 
-Exit codes: 0 success, 1 a defect in sftex, 2 bad configuration or usage (nothing was computed), 3 some images failed and
-the others were delivered, 4 every image failed, 130 interrupted. Results go to stdout, everything else to stderr.
+Exit codes: 0 success, 1 a defect in sftex, 2 bad configuration or usage (nothing was computed), 3 some images failed
+and the others were delivered, 4 every image failed, 130 interrupted. Results go to stdout, the rest to stderr.
 """
 
 from __future__ import annotations

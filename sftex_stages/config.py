@@ -45,7 +45,8 @@ def parse(text: str, stages: Sequence[Stage], name: str = "pipeline.yaml") -> Pa
     root = _compose(text, name)
     problems: list[tuple[int, int, str]] = []  # line, column, words
     marks: dict[Loc, Node] = {}
-    sections = _plain(root, (), marks, problems) if root is not None else {}
+    sections = _plain(root, (), marks, problems) if root is not None else None
+    sections = {} if sections is None else sections
     if not isinstance(sections, dict):
         problems.append((*_position(root), "expected sections such as 'frontal:' with keys indented below them"))
         sections = {}

@@ -69,14 +69,14 @@ def _counts(row: Row) -> list[str]:
 
 
 def _why(rows: Sequence[Row], stages: Sequence[str]) -> list[str]:
-    """Reasons, grouped over images; a plain "new" needs no explanation."""
-    lines = []
+    """Reasons, grouped over images; a plain "new" needs no explanation, nor do results that follow a stage."""
+    lines: list[str] = []
     for stage in stages:
         images: Counter[str] = Counter()
         for row in rows:
             images.update(set(row["stages"][stage]["reasons"]))
         for reason, count in images.most_common():
-            if reason != "new":
+            if reason != "new" and not (stage == stages[-1] and lines):
                 lines.append(f"  {stage}: {reason}" + (f"  ({count} images)" if len(rows) > 1 else ""))
     return ["", "computed again because", *lines] if lines else []
 

@@ -7,6 +7,7 @@ behind. An image is planned again whenever all its queued jobs are done. A faile
 from __future__ import annotations
 
 import heapq
+import os
 import re
 import threading
 import traceback
@@ -144,9 +145,9 @@ class _Run:
     def _task(self, job: Job) -> Task:
         planner = self.planner
         if planner.delivery and job.stage == planner.delivery.name:
-            return Task(planner.store.root, planner.delivery, None, job)
+            return Task(os.getcwd(), planner.store.root, planner.delivery, None, job)
         stage = next(stage for stage in planner.stages if stage.name == job.stage)
-        return Task(planner.store.root, stage, planner.params[stage.name], job)
+        return Task(os.getcwd(), planner.store.root, stage, planner.params[stage.name], job)
 
     def settle(self, outcome: Outcome) -> None:
         """Take note of what a worker did; plan those items again that have nothing left to wait for."""

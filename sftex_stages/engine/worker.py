@@ -36,6 +36,9 @@ _LIBRARIES = ("numpy", "scipy", "h5py", "scikit-learn", "OpenImageIO", "joblib",
 class Task:
     """Everything a worker needs for one job; no arrays."""
 
+    folder: (
+        str  # the run's working directory: workers may be older than it, paths in messages stay as the user wrote them
+    )
     root: Path  # of the store
     work: Stage | Delivery
     params: StageParams | None
@@ -73,7 +76,8 @@ def perform(task: Task) -> Outcome:
     """Run one job and publish its artefact."""
     store, job = Store(task.root), task.job
     try:
-        _crash_log(task.root)
+        os.chdir(task.folder)
+        _crash_log(task.root.absolute())
         reset_peak = _reset_peak_memory()
         started = time.perf_counter()
         image, extra = _compute(task, store)

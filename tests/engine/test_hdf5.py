@@ -51,7 +51,7 @@ def test_bytes_depend_on_the_content_alone():
     image = encode(original)
     assert encode(other) == image
     code = "import test_hdf5 as t, hashlib; print(hashlib.sha256(t.encode(t.arrays())).hexdigest())"
-    paths = json.dumps(sys.path + [__file__.rsplit("/", 1)[0]])
+    paths = json.dumps([*sys.path, __file__.rsplit("/", 1)[0]])
     done = subprocess.run([sys.executable, "-c", f"import sys; sys.path[:] = {paths}; {code}"], capture_output=True)
     assert done.stdout.decode().strip() == hashlib.sha256(image).hexdigest(), done.stderr.decode()
 
