@@ -28,7 +28,7 @@ class Figure:
         if self.unit == "%":
             return f"{100 * value:.1f}"
         if self.unit == "°" or abs(value) < 10:
-            return f"{value:.2f}".rstrip("0").rstrip(".") if self.unit == "" else f"{value:.2f}"
+            return f"{value:.3g}" if self.unit == "" else f"{value:.2f}"
         return f"{value:.0f}"
 
     @property
