@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from sklearn.cluster import KMeans
 
 from .engine.stage import Arrays, Stage, StageParams
 
@@ -35,6 +34,8 @@ def number_of_clusters(points: int, params: Params) -> int:
 
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """Cluster descriptors. Input `detect`. Returns `label` (N,) int32, −1 for points far from every centre, and `count`."""
+    from sklearn.cluster import KMeans  # takes over a second to import, and a cached run does not need it
+
     detect = inputs["detect"]
     descriptors = detect["descriptor"].astype(np.float32)
     k = number_of_clusters(len(descriptors), params)
