@@ -69,9 +69,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.json:
         _print_json(exit_code=code, seconds=seconds, images=rows, not_found=missing, notices=planner.store.notices)
     else:
-        print(report.run_text(rows))
-        for message in missing:
-            print(f"  {message}")
+        print(report.run_text(rows, missing))
         print(f"\n{len(rows)} image{'s' * (len(rows) != 1)} in {seconds:.1f} s")
     return code
 

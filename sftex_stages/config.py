@@ -110,7 +110,8 @@ def _compose(text: str, name: str) -> Node | None:
 
 def _plain(node: Node, loc: Loc, marks: dict[Loc, Node], problems: list[tuple[int, int, str]]) -> Any:
     """The node's value in plain Python; remembers where every key stands and notes equal keys."""
-    if node.anchor or not node.tag.startswith("tag:yaml.org,2002:") or ":python/" in node.tag:
+    tag = node.tag or ""
+    if node.anchor or not tag.startswith("tag:yaml.org,2002:") or ":python/" in tag:
         problems.append(
             (*_position(node), f"{_dotted(loc)}: tags (!) and anchors (&, *) are not supported; write it out")
         )

@@ -47,17 +47,17 @@ def _stage_entry(name: str, state: StageResult, result: ItemResult) -> Row:
     }
 
 
-def run_text(rows: Sequence[Row]) -> str:
-    """The final table: per image the time of every stage or "cached", and below why anything was computed."""
+def run_text(rows: Sequence[Row], missing: Sequence[str]) -> str:
+    """The final table: per image the time of every stage or "cached"; why anything was computed; what failed."""
     stages = list(rows[0]["stages"])
     head = ["image", *stages, "instances", "textons", "files"]
     table = [[row["image"], *(_cell(row["stages"][s]) for s in stages), *_counts(row)] for row in rows]
-    return "\n".join([*columns(head, table), *_why(rows, stages), *_where(rows)])
+    return "\n".join([*columns(head, table), *_why(rows, stages), *_where(rows, missing)])
 
 
 def _cell(entry: Row) -> str:
     if entry["state"] != "computed":
-        return {"not reached": "–"}.get(entry["state"], entry["state"])
+        return "–" if entry["state"] == "not reached" else str(entry["state"])
     part = f" ({entry['computed']} of {entry['jobs']})" if entry["jobs"] > 1 else ""
     return f"{entry['seconds']:.1f} s{part}"
 
@@ -77,15 +77,17 @@ def _why(rows: Sequence[Row], stages: Sequence[str]) -> list[str]:
             images.update(set(row["stages"][stage]["reasons"]))
         for reason, count in images.most_common():
             if reason != "new" and not (stage == stages[-1] and lines):
-                lines.append(f"  {stage}: {reason}" + (f"  ({count} images)" if len(rows) > 1 else ""))
+                lines.append(f"  {stage}: {reason}" + (f"  ({count} of {len(rows)} images)" if len(rows) > 1 else ""))
     return ["", "computed again because", *lines] if lines else []
 
 
-def _where(rows: Sequence[Row]) -> list[str]:
+def _where(rows: Sequence[Row], missing: Sequence[str]) -> list[str]:
     failed = [f"  {row['image']}: {row['error']}" for row in rows if row["status"] != "ok"]
+    failed += [f"  {message}" for message in missing]
+    total = len(rows) + len(missing)
     written = [f"  {row['folder']}" for row in rows if row["status"] == "ok"]
     lines = ["", "results in", *written] if written else []
-    return lines + (["", f"failed: {len(failed)} of {len(rows)} images", *failed] if failed else [])
+    return lines + (["", f"failed: {len(failed)} of {total} images", *failed] if failed else [])
 
 
 def status_rows(plans: Sequence[tuple[str, Plan | None, str]]) -> list[Row]:

@@ -151,7 +151,7 @@ class Planner:
                 step.done[part] = receipt
             else:
                 job = Job(plan.item.name, stage.name, part, key, named, inputs, paths)
-                step.todo.append((job, problem or self._why(job)))
+                step.todo.append((job, problem or self._why(job) or "not in the cache any more"))
         return step
 
     def _delivery(self, delivery: Delivery, plan: Plan) -> Step:
@@ -176,17 +176,18 @@ class Planner:
             step.done[None] = receipt
         else:
             job = Job(plan.item.name, delivery.name, None, key, identity, inputs, {}, str(folder), meta)
-            step.todo.append((job, problem or self._why(job)))
+            # files that belong to another outcome are not damaged: that outcome was the last, and this one differs
+            step.todo.append((job, self._why(job) or problem or "not in the cache any more"))
         return step
 
     def _why(self, job: Job) -> str:
-        """Compare with the last result of the same image and stage."""
+        """Compare with the last result of the same image and stage; "" if there is no difference."""
         if job.stage not in self._history:
             self._history[job.stage] = self.store.history(job.stage)
         previous = self._history[job.stage].get((job.item, job.part))
         if previous is None:
             return "new"
-        return "; ".join(keys.differences(previous["identity"], job.identity)) or "not in the cache any more"
+        return "; ".join(keys.differences(previous["identity"], job.identity))
 
 
 def _content(sources: Source | list[Source]) -> str | list[str]:

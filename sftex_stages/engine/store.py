@@ -52,7 +52,7 @@ class Store:
 
     def path(self, stage: str, key: str, suffix: str = ".h5") -> Path:
         """Where a file of the job `key` of `stage` lives."""
-        return self.root / stage / key[:2] / (key + suffix)
+        return Path(f"{self.root}/{stage}/{key[:2]}/{key}{suffix}")
 
     def prepare(self) -> None:
         """Create the store and prove that it can be written; StoreError (with what to do) otherwise."""
