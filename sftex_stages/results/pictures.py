@@ -22,19 +22,23 @@ def instances(photo: np.ndarray, surface: Arrays, size: int = 1600) -> np.ndarra
     """The instances as small circles lying on the surface, seen at their slant and tilt (the paper's Fig. 2, 11).
 
     photo (H, W, 3) uint8; surface: the stage's `instance/*`. Each circle is the image T · (unit circle) of one common
-    radius, with a stroke along its normal; green: surely an instance and on the surface, red: surely not.
+    radius, with a stroke along its normal; green: surely an instance and on the surface, red: surely not. Where they
+    would cover each other, some are left out, without regard to their colour.
     """
     h, w = photo.shape[:2]
     zoom = float(np.clip(size / max(h, w), 0.05, 4))
     picture = cv2.resize(photo, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC)
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)[..., None]
     picture = (0.25 * picture + 0.45 * grey + 50).astype(np.uint8)  # pale, so that the circles stand out
-    xy, transform, normal = surface["instance/xy"], surface["instance/transform"], surface["instance/normal"]
-    trust = surface["instance/inlier"] * (1 - surface["instance/state"][:, 2])
-    radius = _radius(xy, (h, w))
-    size_of_all = float(np.median(np.linalg.svd(transform, compute_uv=False)[:, 0])) if len(xy) else 1.0
+    radius = _radius(surface["instance/xy"], (h, w))
+    some = _apart(surface["instance/xy"], 2 * radius)
+    xy, transform, normal = (surface[f"instance/{name}"][some] for name in ("xy", "transform", "normal"))
+    trust = (surface["instance/inlier"] * (1 - surface["instance/state"][:, 2]))[some]
+    sizes = np.linalg.svd(transform, compute_uv=False)[:, :1, None]
+    typical = np.median(sizes) if len(sizes) else 1.0  # the unit disc's own size means nothing to a reader
+    transform = transform / np.clip(sizes, typical / 2, typical * 2) * np.clip(sizes / typical, 0.5, 2)
     angle = np.linspace(0, 2 * np.pi, 33)
-    circle = radius / size_of_all * np.stack([np.cos(angle), np.sin(angle)])
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)])
     rings = _pixels(xy[:, None] + (transform @ circle).transpose(0, 2, 1), zoom)
     strokes = _pixels(np.stack([xy, xy + 1.25 * radius * normal[:, :2]], 1), zoom)
     # Twenty shades, drawn shade by shade, the sure ones last and so on top; a dark rim keeps them legible on any print.
@@ -48,7 +52,9 @@ def instances(photo: np.ndarray, surface: Arrays, size: int = 1600) -> np.ndarra
                 picture, list(lines[shade == k]), closed, _traffic_light((k + 0.5) / 20), width, cv2.LINE_AA, _SUB
             )
     used = len(np.unique(surface["instance/texton"]))
-    words = f"{len(xy)} instances of {used} textons, each as a circle on the surface with its normal"
+    n = len(surface["instance/xy"])
+    count = f"{n} instances" if len(some) == n else f"{len(some)} of {n} instances"
+    words = f"{count} of {used} textons, as circles on the surface with their normals"
     return _legend(picture, words, [("sure", 1.0), ("doubtful", 0.5), ("rejected", 0.0)])
 
 
@@ -129,7 +135,22 @@ def _radius(xy: np.ndarray, shape: tuple[int, int]) -> float:
     from scipy.spatial import cKDTree
 
     apart = np.median(cKDTree(xy).query(xy, k=2)[0][:, 1])
-    return float(np.clip(0.45 * apart, 0.005 * max(shape), 0.03 * max(shape)))
+    return float(np.clip(0.45 * apart, 0.011 * max(shape), 0.03 * max(shape)))
+
+
+def _apart(xy: np.ndarray, distance: float) -> np.ndarray:
+    """Indices of points at least about `distance` apart, in a fixed random order of preference."""
+    if not len(xy):
+        return np.zeros(0, int)
+    cells = np.floor((xy - xy.min(0)) / distance * 8).astype(int) + 8  # eight cells to the distance
+    covered = np.zeros(cells.max(0)[::-1] + 9, np.uint8)
+    chosen = []
+    for i in np.random.default_rng(0).permutation(len(xy)):
+        x, y = map(int, cells[i])
+        if not covered[y, x]:
+            cv2.circle(covered, (x, y), 8, 1, cv2.FILLED)
+            chosen.append(i)
+    return np.sort(np.array(chosen))
 
 
 def _pixels(points: np.ndarray, zoom: float) -> np.ndarray:

@@ -49,7 +49,7 @@ def test_colour_tells_the_posterior() -> None:
     assert doubtful[0] > 2 * doubtful[2] and doubtful[1] > 2 * doubtful[2]
 
 
-def test_circles_grow_with_the_distance_of_neighbours_and_all_are_drawn(arrays: dict) -> None:
+def test_circles_grow_with_the_distance_of_neighbours(arrays: dict) -> None:
     xy = np.stack(np.meshgrid(np.arange(5, 500, 20), np.arange(5, 400, 20)), -1).reshape(-1, 2)
     assert pictures._radius(xy, (400, 500)) == pytest.approx(9)
     photo = np.zeros((90, 130, 3), np.uint8)
@@ -57,7 +57,11 @@ def test_circles_grow_with_the_distance_of_neighbours_and_all_are_drawn(arrays: 
     empty = pictures.instances(photo, {k: v[:0] for k, v in arrays["surface"].items() if k.startswith("instance/")})
     assert picture.shape == empty.shape and picture.shape[1] == 130 * 4
     changed = (picture.astype(int) - empty).any(2)
-    for x, y in arrays["surface"]["instance/xy"]:
+    some = pictures._apart(
+        arrays["surface"]["instance/xy"], 2 * pictures._radius(arrays["surface"]["instance/xy"], (90, 130))
+    )
+    assert 20 < len(some) < 40
+    for x, y in arrays["surface"]["instance/xy"][some]:
         assert changed[int(y * 4) - 2 : int(y * 4) + 6, int(x * 4) - 2 : int(x * 4) + 6].any()
 
 
@@ -133,3 +137,11 @@ def test_ticks_are_few_round_and_inside(low: float, high: float) -> None:
     ticks = pictures._ticks(low, high)
     assert 4 <= len(ticks) <= 10 and all(low <= t <= high for t in ticks)
     assert all(len(f"{t:g}".replace(".", "").strip("0")) <= 3 for t in ticks)
+
+
+def test_crowds_are_thinned_evenly() -> None:
+    xy = np.random.default_rng(1).uniform(0, 300, (5000, 2))
+    some = pictures._apart(xy, 20)
+    gaps = np.linalg.norm(xy[some][:, None] - xy[some][None], axis=2) + 1e9 * np.eye(len(some))
+    assert gaps.min() > 17
+    assert np.linalg.norm(xy[:, None] - xy[some][None], axis=2).min(1).max() < 25  # nowhere is a gap left
