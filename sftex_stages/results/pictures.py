@@ -54,7 +54,7 @@ def instances(photo: np.ndarray, surface: Arrays, size: int = 1600) -> np.ndarra
     used = len(np.unique(surface["instance/texton"]))
     n = len(surface["instance/xy"])
     count = f"{n} instances" if len(some) == n else f"{len(some)} of {n} instances"
-    words = f"{count} of {used} textons, as circles on the surface with their normals"
+    words = f"{count} of {used} texton{'s' * (used != 1)}, as circles on the surface with their normals"
     return _legend(picture, words, [("sure", 1.0), ("doubtful", 0.5), ("rejected", 0.0)])
 
 
@@ -231,18 +231,19 @@ def _colors(level: np.ndarray) -> np.ndarray:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Four to ten round numbers in a range of ratios."""
-    for steps in (
-        [1],
-        [1, 2, 5],
-        [1, 1.5, 2, 3, 5, 7],
-        [k / 10 for k in range(10, 100)],
-        [k / 50 for k in range(50, 500)],
-    ):
-        found = sorted(s * 10.0**e for e in range(-6, 7) for s in steps if low <= s * 10.0**e <= high)
-        if len(found) >= 4:
-            return [float(f"{t:.4g}") for t in found[:: -(-len(found) // 10)]]
-    return [float(f"{t:.3g}") for t in np.geomspace(low, high, 4)]
+    """A few round numbers in a range of ratios: evenly spaced in a narrow range, by decades and their parts in a wide one."""
+    if high < 3 * low:
+        step = 10.0 ** np.floor(np.log10(high - low))
+        step *= next(m for m in (0.2, 0.5, 1, 2) if (high - low) / (m * step) <= 8)
+        ticks = np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
+    else:
+        decades = 10.0 ** np.arange(-7, 8)[:, None]
+        for parts in ([1, 1.5, 2, 3, 5, 7], [1, 2, 5], [1]):
+            ticks = np.ravel(decades * parts)
+            ticks = ticks[(ticks >= low) & (ticks <= high)]
+            if len(ticks) <= 9:
+                break
+    return [float(f"{t:.4g}") for t in ticks]
 
 
 def _write(

@@ -132,10 +132,13 @@ def test_irradiance_is_monotone_and_calm_when_constant(monkeypatch: pytest.Monke
     assert flat.std(axis=(0, 1)).max() < 12
 
 
-@pytest.mark.parametrize("low, high", [(0.97, 1.06), (0.2, 5), (1e-3, 40), (0.9, 1.1)])
+@pytest.mark.parametrize(
+    "low, high", [(0.97, 1.06), (0.2, 5), (1e-3, 40), (0.9, 1.1), (0.5, 1.49), (0.5, 1.51), (0.91, 1.09)]
+)
 def test_ticks_are_few_round_and_inside(low: float, high: float) -> None:
     ticks = pictures._ticks(low, high)
-    assert 4 <= len(ticks) <= 10 and all(low <= t <= high for t in ticks)
+    assert 3 <= len(ticks) <= 10 and all(low <= t <= high for t in ticks)
+    assert max(np.diff(np.log([low, *ticks, high]))) < 0.62 * np.log(high / low)
     assert all(len(f"{t:g}".replace(".", "").strip("0")) <= 3 for t in ticks)
 
 
