@@ -1,6 +1,7 @@
 import os
 
 import pytest
+from joblib.externals.loky import get_reusable_executor
 
 
 @pytest.fixture(scope="session")
@@ -8,6 +9,7 @@ def log(tmp_path_factory):
     """Where the toy stages count their executions: one folder for all tests, as worker processes live longer than one."""
     path = tmp_path_factory.mktemp("log")
     os.environ["TOY_LOG"] = str(path)
+    get_reusable_executor().shutdown(wait=True)  # workers of other tests do not know the variable
     yield path
     del os.environ["TOY_LOG"]
 
