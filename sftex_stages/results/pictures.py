@@ -208,8 +208,8 @@ def _caption(picture: np.ndarray, texton: Arrays, number: int, count: int, at: t
         if np.isfinite(texton["metric_residual"]):
             _write(picture, f"residual {float(texton['metric_residual']):.3f}", (x, y + 37), 13, FAINT)
         return
-    for i, line in enumerate(textwrap.wrap(str(texton["reason"]) or "not usable", 27, max_lines=3, placeholder=" …")):
-        _write(picture, line, (x, y + 18 + 17 * i), 13, WARNING)
+    for i, line in enumerate(textwrap.wrap(str(texton["reason"]) or "not usable", 29, max_lines=4, placeholder=" …")):
+        _write(picture, line, (x, y + 16 + 15 * i), 12, WARNING)
 
 
 def _missing(frontal: list[Arrays]) -> list[str]:
