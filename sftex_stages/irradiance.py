@@ -14,9 +14,10 @@ from sftex_stages.geometry import field, spline
 class Params(StageParams):
     """Parameters of the irradiance stage."""
 
-    min_inlier: float = Field(0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8).")
-    noise_floor: float = Field(0.01, gt=0, le=1, description="Smallest relative error of an instance's irradiance believed.")
-    detail: float = Field(0.7, gt=0.2, le=4, description="Spacing of the field's grid, in mean spacings of instances.")
+    min_inlier: float = Field(0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)")
+    noise_floor: float = Field(0.01, gt=0, le=1, description="Least relative error of an irradiance that is believed")
+    nodes: int = Field(2000, ge=50, le=20000, description="Most cells that instances are pooled in to find the smoothness")
+    detail: float = Field(0.8, gt=0.2, le=4, description="Spacing of the field's grid, in spacings of those cells")
 
 
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
@@ -47,12 +48,11 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     xy = surface["instance/xy"][used].astype(float)
     sigma = np.hypot(surface["instance/irradiance_sigma"][used].astype(float), params.noise_floor)
     trust = np.maximum(1 - outside[used], 0.01)
-    low, high = xy.min(0), xy.max(0)
-    spacing = float(np.sqrt(np.prod(np.maximum(high - low, 1)) / used.sum()))
-    grid = spline.cover(low - 2 * spacing, high + 2 * spacing, params.detail * spacing)
-    result = field.fit(xy, np.log(light[used]), sigma, index, trust, grid, spacing)
+    area = float(np.prod(np.maximum(np.ptp(xy, axis=0), 1.0)))
+    spacing = float(np.sqrt(area / min(len(xy), params.nodes)))
+    result = field.fit(xy, np.log(light[used]), sigma, index, trust, spacing, params.detail)
     rows, columns = np.arange(valid.shape[0], dtype=float), np.arange(valid.shape[1], dtype=float)
-    log_map = spline.evaluate(grid, result.a, columns, rows)
+    log_map = spline.evaluate(result.grid, result.a, columns, rows)
     mean = float(log_map[valid].mean()) if valid.any() else 0.0
     count = int(inputs["surface"]["instance/texton"].max()) + 1
     scale = np.full(count, np.nan)

@@ -30,36 +30,36 @@ class Smoothness:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Where the products of N stencils go in the blocks of a block tridiagonal matrix."""
+    """Where the products of N stencils go in the band of a matrix of `size` coefficients in blocks of `b`."""
 
-    position: Int  # into diagonal blocks followed by blocks below, for those of the N * 256 pairs in `keep`
+    position: Int  # into the transposed band, for those of the N * 256 pairs in `keep`
     keep: Int
-    count: int
+    size: int
+    width: int
     b: int
 
-    def __call__(self, products: Float) -> blocks.Matrix:
-        """Sum of `products` (N, 16, 16)."""
-        size = self.b * self.b
-        flat = np.bincount(self.position, products.ravel()[self.keep], (2 * self.count - 1) * size)
-        cut = self.count * size
-        return flat[:cut].reshape(-1, self.b, self.b), flat[cut:].reshape(-1, self.b, self.b)
+    def __call__(self, products: Float) -> Float:
+        """Lower band storage of the sum of `products` (N, 16, 16)."""
+        flat = np.bincount(self.position, products.ravel()[self.keep], (self.width + 1) * self.size)
+        return flat.reshape(self.size, self.width + 1).T
+
+    def pack(self, matrix: sp.spmatrix) -> Float:
+        """The same storage for a sparse matrix."""
+        return blocks.pack(matrix, self.width)
 
 
 def scatter(grid: spline.Grid, index: Int) -> Scatter:
     """The scatter of stencils with coefficients `index` (N, 16)."""
     b = spline.BLOCK * grid.shape[1]
-    block, inner = np.divmod(index, b)
-    count = grid.size // b
-    bi, bj = block[:, :, None], block[:, None, :]
-    lower = np.flatnonzero((bi >= bj).ravel())
-    number = np.where(bi == bj, bi, count + bj)
-    position = (number * b + inner[:, :, None]) * b + inner[:, None, :]
-    return Scatter(position.ravel()[lower], lower, count, b)
+    width = b + spline.BLOCK
+    i, j = index[:, :, None], index[:, None, :]
+    lower = np.flatnonzero((i >= j).ravel())
+    return Scatter((j * (width + 1) + i - j).ravel()[lower], lower, grid.size, width, b)
 
 
 @dataclass(frozen=True)
 class Field:
-    """A grid with the gradient stencils of N points on it and the energies of its prior, E0 … E3, as blocks."""
+    """A grid with the gradient stencils of N points on it and the energies of its prior, E0 … E3."""
 
     grid: spline.Grid
     index: Int  # (N, 16)
@@ -67,7 +67,7 @@ class Field:
     value: Float  # (N, 16), height in px
     design: sp.csr_matrix  # (2N, M): the gradient stencils, rows interleaved
     add: Scatter
-    energies: tuple[blocks.Matrix, ...]
+    energies: tuple[Float, ...]  # band storage
     logdets: dict[Smoothness, float] = field(default_factory=dict, compare=False)  # of priors, as they are asked for
 
 
@@ -76,23 +76,15 @@ def make_field(grid: spline.Grid, xy: Float) -> Field:
     index, p = spline.stencil(grid, xy, 1, 0)
     stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
     add = scatter(grid, index)
-    energies = tuple(blocks.split(spline.energy(grid, m), add.b) for m in range(4))
+    energies = tuple(add.pack(spline.energy(grid, m)) for m in range(4))
     return Field(grid, index, stencil, spline.stencil(grid, xy)[1], spline.gradient_design(grid, xy), add, energies)
 
 
-def prior(f: Field, smooth: Smoothness) -> blocks.Matrix:
-    """Prior precision P, positive definite; its lowest terms are weak and fixed."""
+def prior(f: Field, smooth: Smoothness) -> Float:
+    """Prior precision P in band storage, positive definite; its lowest terms are weak and fixed."""
     area = float(np.prod(f.grid.cells)) * f.grid.spacing**2
-    weights = (
-        1 / (area * HEIGHT_SCALE) ** 2,
-        1 / (area * SLOPE_SCALE**2),
-        smooth.strength,
-        smooth.strength * smooth.reach**2,
-    )
-    return (
-        sum(w * e[0] for w, e in zip(weights, f.energies, strict=True)),
-        sum(w * e[1] for w, e in zip(weights, f.energies, strict=True)),
-    )  # type: ignore[return-value]
+    weak = f.energies[0] / (area * HEIGHT_SCALE) ** 2 + f.energies[1] / (area * SLOPE_SCALE**2)
+    return weak + smooth.strength * (f.energies[2] + smooth.reach**2 * f.energies[3])
 
 
 def reasonable(f: Field, strength: float, reach: float) -> bool:
@@ -104,17 +96,16 @@ def reasonable(f: Field, strength: float, reach: float) -> bool:
 def prior_logdet(f: Field, smooth: Smoothness) -> float:
     """log det P, remembered."""
     if smooth not in f.logdets:
-        f.logdets[smooth] = blocks.factor(prior(f, smooth)).logdet
+        f.logdets[smooth] = blocks.factor(prior(f, smooth), f.add.b).logdet
     return f.logdets[smooth]
 
 
-def posterior(f: Field, weight: Float, precision: blocks.Matrix, height: Float | None = None) -> blocks.Factor:
+def posterior(f: Field, weight: Float, precision: Float, height: Float | None = None) -> blocks.Factor:
     """Factor of A = Bᵀ W B + P for `weight` (N, 2, 2), and optionally precisions (N,) of measured heights."""
     products = np.swapaxes(f.stencil, 1, 2) @ (weight @ f.stencil)
     if height is not None:
         products += height[:, None, None] * f.value[:, :, None] * f.value[:, None, :]
-    diagonal, below = f.add(products)
-    return blocks.factor((diagonal + precision[0], below + precision[1]))
+    return blocks.factor(f.add(products) + precision, f.add.b)
 
 
 def pulled(f: Field, pull: Float) -> Float:

@@ -5,6 +5,7 @@ with `w` of `tensors.py`, Omega_i the measured precision over a common noise fac
 that what is not from the surface loses its say. Smoothness and noise factor maximise the marginal likelihood (Laplace).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,7 +49,7 @@ def step(
     """One Gauss-Newton step: coefficients, factor, and the information and pull it was made with."""
     information, pull, _ = linearise(w, omega, g)
     factor = gaussian.posterior(f, information, gaussian.prior(f, smooth))
-    return blocks.solve(factor, f.design.T @ pull.ravel()), factor, information, pull
+    return blocks.solve(factor, gaussian.pulled(f, pull)), factor, information, pull
 
 
 def student(w: Float, omega: Float, g: Float, spread: Float) -> tuple[Float, Float]:
@@ -60,60 +61,60 @@ def student(w: Float, omega: Float, g: Float, spread: Float) -> tuple[Float, Flo
     return (FREEDOM + 2) / (FREEDOM + chi2), chi2
 
 
-def tune(
-    f: gaussian.Field, w: Float, omega: Float, g: Float, smooth: gaussian.Smoothness, noise: float, rounds: int
-) -> tuple[gaussian.Smoothness, float, float]:
-    """Smoothness and noise factor of greatest evidence near the given ones (pattern search in log scale), and the evidence."""
-
-    def score(x: tuple[float, ...]) -> float:
-        strength, reach, factor = np.exp(x)
-        if not NOISE_FACTORS[0] <= factor <= NOISE_FACTORS[1]:
-            return -np.inf
-        information, pull, constant = linearise(w, omega / factor, g)
-        return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach))
-
-    best = (np.log(smooth.strength), np.log(smooth.reach), np.log(noise))
-    value = score(best)
-    pace = np.array([1.2, 0.7, 0.5])
-    for _ in range(rounds):
-        moved = False
-        for k in range(3):
-            for sign in (1, -1):
-                trial = tuple(b + sign * pace[k] * (j == k) for j, b in enumerate(best))
-                new = score(trial)
-                if new > value:
-                    best, value, moved = trial, new, True
-                    break
-        if not moved:
-            pace = pace / 2
-    return gaussian.Smoothness(float(np.exp(best[0])), float(np.exp(best[1]))), float(np.exp(best[2])), value
-
-
 def refine(
-    f: gaussian.Field, w: Float, covariance: Float, weight: Float, start: Float, smooth: gaussian.Smoothness, steps: int = 4
+    f: gaussian.Field,
+    w: Float,
+    covariance: Float,
+    trust: Float,
+    start: Float,
+    smooth: gaussian.Smoothness,
+    rounds: int = 4,
 ) -> Solution:
-    """The surface from tensors `w` (N, 2) with `covariance` (N, 2, 2), trusted by `weight` (N,) in 0…1.
+    """The surface from tensors `w` (N, 2) with `covariance` (N, 2, 2), trusted by `trust` (N,) in 0…1.
 
     Parameters
     ----------
     start : (N, 2)
         gradients with their signs decided; only where it starts, the tensors decide the rest.
-    steps : int
-        rounds of: robust weights, tuning, Gauss-Newton.
+    rounds : int
+        of: smoothness and noise by one pattern search step, two Gauss-Newton steps, new robust weights.
     """
     precision = np.linalg.inv(covariance)
-    g, noise, robust = start, 1.0, weight.copy()
-    value = -np.inf
-    for n in range(steps):
-        smooth, noise, value = tune(f, w, precision * robust[:, None, None], g, smooth, noise, 3 if n else 4)
+    g, robust = limit(start), trust.copy()
+    x, pace = np.log([smooth.strength, smooth.reach, 1.0]), np.array([0.7, 0.7, 0.7])
+
+    def score(x: Float) -> float:
+        strength, reach, noise = map(float, np.exp(x))
+        if not gaussian.reasonable(f, strength, reach) or not NOISE_FACTORS[0] <= noise <= NOISE_FACTORS[1]:
+            return -np.inf
+        information, pull, constant = linearise(w, precision * (robust / noise)[:, None, None], g)
+        return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach))
+
+    for _ in range(rounds):
+        x, moved = climb(score, x, pace)
+        pace = pace if moved else pace / 2
+        strength, reach, noise = map(float, np.exp(x))
+        smooth = gaussian.Smoothness(strength, reach)
         for _ in range(2):
-            omega = precision * (robust / noise)[:, None, None]
-            a, factor, information, pull = step(f, w, omega, g, smooth)
+            a, factor, information, pull = step(f, w, precision * (robust / noise)[:, None, None], g, smooth)
             g = limit(gaussian.gradients(f, a))
         spread = gaussian.gradient_covariance(f, factor)
         mean, alone = gaussian.without_own(g, spread, information, pull)
-        robust = weight * student(w, precision / noise, limit(mean), alone)[0]
-    return Solution(a, factor, g, spread, robust, smooth, noise, value)
+        robust = trust * student(w, precision / noise, limit(mean), alone)[0]
+    return Solution(a, factor, g, spread, robust, smooth, noise, score(x))
+
+
+def climb(score: Callable[[Float], float], x: Float, pace: Float) -> tuple[Float, bool]:
+    """One round of pattern search: the first better neighbour of `x` (K,) at ±`pace` (K,) along every axis in turn."""
+    value, moved = score(x), False
+    for k in range(len(x)):
+        for sign in (1, -1):
+            trial = x + sign * pace * (np.arange(len(x)) == k)
+            new = score(trial)
+            if new > value:
+                x, value, moved = trial, new, True
+                break
+    return x, moved
 
 
 def limit(g: Float, steepest: float = 12.0) -> Float:

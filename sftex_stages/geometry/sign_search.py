@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sftex_stages.geometry import blocks, gaussian, shading, signs
+from sftex_stages.geometry.refine import climb
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -48,8 +49,7 @@ class Candidate:
     smooth: gaussian.Smoothness
     noise: float
     inside: Float  # (N,) posterior of being from the surface
-    gradient: Float  # (N, 2) of the surface
-    height: Float  # (N,) of the surface, px
+    a: Float  # coefficients of the surface on the search's grid
     light: shading.Light | None
     origin: str
 
@@ -175,22 +175,14 @@ def judge(
         a = blocks.solve(solved, gaussian.pulled(f, pull))
         g = gaussian.gradients(f, a)
         mean, alone = gaussian.without_own(g, gaussian.gradient_covariance(f, solved), weight, pull)
+        if n == 0:  # the noise that the residuals show, before any search
+            total = np.linalg.inv(alone + factor * data.covariance)
+            chi2 = np.einsum("ni,nij,nj->n", y - mean, total, y - mean)
+            best[2] = np.log(factor * np.clip(np.median(chi2) / (2 * np.log(2)), 0.1, 10))
+            factor = float(np.exp(best[2]))
         inside = data.trust * _inside(data, y - mean, alone, factor)
     shade, light = shade_of(data, s)
-    return Candidate(s, score(best), shade, smooth, factor, inside, g, gaussian.heights(f, a), light, origin)
-
-
-def climb(score, x: Float, pace: Float) -> tuple[Float, bool]:  # type: ignore[no-untyped-def]
-    """One round of pattern search: the first better neighbour of `x` (K,) at ±`pace` (K,) along every axis in turn."""
-    value, moved = score(x), False
-    for k in range(len(x)):
-        for sign in (1, -1):
-            trial = x + sign * pace * (np.arange(len(x)) == k)
-            new = score(trial)
-            if new > value:
-                x, value, moved = trial, new, True
-                break
-    return x, moved
+    return Candidate(s, score(best), shade, smooth, factor, inside, a, light, origin)
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -237,9 +229,9 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
         order = order[distinct(patterns[:, order], data.trust)][:survivors]
         patterns, names, lit = patterns[:, order], [names[j] for j in order], lit[order]
         pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
-    first = [judge(data, f, s, smooth, 1.0, 1, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
+    first = [judge(data, f, s, smooth, 1.0, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
-    last = [judge(data, f, x.s, x.smooth, x.noise, 3, x.origin) for x in first[:finalists]]
+    last = [judge(data, f, x.s, x.smooth, x.noise, 2, x.origin) for x in first[:finalists]]
     return sorted(last, key=lambda x: -x.evidence)
 
 

@@ -122,7 +122,7 @@ def energy(grid: Grid, order: int) -> sp.csr_matrix:
             j = (np.arange(n)[:, None, None] + np.arange(4)).repeat(4, 1)
             value = np.broadcast_to(cell, (n, 4, 4)).ravel()
             grams[-1].append(sp.csr_matrix((value, (i.ravel(), j.ravel())), shape=(n + 3, n + 3)))
-    terms = [comb(order, d) * sp.kron(grams[0][d], grams[1][order - d]) for d in range(order + 1)]
+    terms = [comb(order, d) * sp.kron(grams[0][d], grams[1][order - d], format="csr") for d in range(order + 1)]
     return sp.csr_matrix(sum(terms[1:], terms[0]))
 
 

@@ -40,11 +40,9 @@ def dense(
     pace = max(spacing / 3, 1.0)
     at_x, at_y = (np.linspace(0, n - 1, max(int(np.ceil((n - 1) / pace)) + 1, 2)) for n in (shape[1], shape[0]))
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
-    index, p = spline.stencil(f.grid, points, 1, 0)
-    stencil = np.stack((p, spline.stencil(f.grid, points, 0, 1)[1]), 1)
-    covariance = blocks.covariance(blocks.selected_inverse(factor), index, stencil, stencil)
-    slope = np.einsum("npk,nk->np", stencil, a[index])
-    sigma = np.degrees(tensors.angular_error(slope, covariance)).reshape(len(at_y), len(at_x))
+    slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
+    spread = covariance_at(f.grid, factor, points)
+    sigma = np.degrees(tensors.angular_error(slope, spread)).reshape(len(at_y), len(at_x))
     far = supported(xy, spacing, points).reshape(sigma.shape)
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {
@@ -53,6 +51,17 @@ def dense(
         "sigma": sigma,
         "supported": (far <= 1) & (sigma <= WORST),
     }
+
+
+def covariance_at(grid: spline.Grid, factor: blocks.Factor, xy: Float) -> Float:
+    """Posterior covariance (N, 2, 2) of the gradient at any `xy` (N, 2) px."""
+    index, p = spline.stencil(grid, xy, 1, 0)
+    stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
+    inverse = blocks.selected_inverse(factor)
+    parts = range(0, len(xy), 4096)  # 256 numbers a point: bounded memory
+    return np.concatenate(
+        [blocks.covariance(inverse, index[k : k + 4096], stencil[k : k + 4096], stencil[k : k + 4096]) for k in parts]
+    )
 
 
 def _enlarge(coarse: Float, shape: tuple[int, int]) -> Float:

@@ -62,12 +62,17 @@ def normals(g: Float) -> Float:
 
 
 def angular_error(g: Float, covariance: Float) -> Float:
-    """Root mean square angle (…,) in radians of the normal of `g` (…, 2) under a small gradient error of that covariance.
+    """Root mean square angle (…,) in radians between the normal of `g` (…, 2) and those of gradients of that covariance.
 
-    A change along the gradient turns the normal by dt / (1 + t²), one across it by dt / sqrt(1 + t²), t = |g|.
+    Averaged over four points one standard deviation out along the axes of the covariance (times sqrt 2, so that they have
+    it): near the rim, where slopes run away, the linear formula would promise far too much.
     """
-    t2 = (g**2).sum(-1)
-    k = 1 / (1 + t2)
-    along = np.einsum("...i,...ij,...j->...", g, covariance, g)  # t² times the variance along g
-    total = covariance[..., 0, 0] + covariance[..., 1, 1]
-    return np.sqrt(np.maximum(total * k - along * k * k, 0))
+    values, axes = np.linalg.eigh(covariance)
+    out = np.sqrt(2 * np.maximum(values, 0))[..., None, :] * axes  # columns
+    n = normals(g)
+    total = np.zeros(g.shape[:-1])
+    for k in range(2):
+        for sign in (1, -1):
+            other = normals(g + sign * out[..., k])
+            total += np.arctan2(np.linalg.norm(np.cross(n, other), axis=-1), (n * other).sum(-1)) ** 2
+    return np.sqrt(total / 4)

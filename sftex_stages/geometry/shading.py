@@ -1,0 +1,98 @@
+"""Shading as a cue for signs: irradiance against normals, one unknown light.
+
+    E_i = a + b n_z,i + s_i (c_x, c_y)·n_xy,i + u(x_i) + noise
+
+with E_i the relative irradiance on the textons' common scale, (a, b, c) the light, and u a slowly varying remainder (a near
+light, interreflection, soft shadows) with a prior; noise is Student distributed (cast shadows, highlights). Given the signs
+all this is linear; given the light, the data are a linear field on the signs.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sftex_stages.geometry import spline
+
+Float = NDArray[np.float64]
+
+FREEDOM = 4.0
+REMAINDER_CELLS = 3  # along the longer side: u must not follow folds
+REMAINDER_SPREAD = 0.25  # standard deviation of u, of the mean irradiance
+QUIET = 0.03  # least noise believed, of the mean irradiance: model error of "one light"
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Irradiance `e` (M,) of mean 1, its variance (M,), measured normals (M, 3) with any sign, and the basis (M, U) of u."""
+
+    e: Float
+    variance: Float
+    normal: Float
+    basis: Float
+
+
+@dataclass(frozen=True)
+class Light:
+    """`direction` (a, b, c_x, c_y), `remainder` (U,), noise scale, Student weights (M,), log likelihood in nats."""
+
+    direction: Float
+    remainder: Float
+    noise: float
+    weight: Float
+    log_likelihood: float
+
+
+def make_shading(xy: Float, e: Float, variance: Float, normal: Float) -> Shading:
+    """Shading data of nodes at `xy` (M, 2) px."""
+    low, high = xy.min(0), xy.max(0)
+    grid = spline.cover(low, high, float((high - low).max()) / REMAINDER_CELLS)
+    return Shading(e, variance, normal, np.asarray(spline.design(grid, xy).todense()))
+
+
+def fit(data: Shading, m: Float, start: Light | None = None, rounds: int = 3, directed: bool = True) -> Light:
+    """The light for mean signs `m` (M,); `directed=False` leaves (c_x, c_y) at zero, the null hypothesis."""
+    n = data.normal
+    ones = np.ones(len(n))
+    columns = [ones, n[:, 2], m * n[:, 0], m * n[:, 1]] if directed else [ones, n[:, 2]]
+    x = np.concatenate((np.stack(columns, 1), data.basis), 1)
+    k = len(columns)
+    weight = ones if start is None else start.weight
+    noise = 0.1 if start is None else start.noise
+    ridge = np.concatenate((np.full(k, 1e-4), np.full(data.basis.shape[1], 1 / REMAINDER_SPREAD**2)))
+    beta = np.zeros(x.shape[1])
+    for _ in range(rounds):
+        strength = weight / (noise**2 + data.variance)
+        normal = x.T @ (strength[:, None] * x) + np.diag(ridge)
+        if directed:  # E[s²] = 1 although E[s]² = m² < 1
+            lost = strength * (1 - m**2)
+            normal[2:4, 2:4] += n[:, :2].T @ (lost[:, None] * n[:, :2])
+        beta = np.linalg.solve(normal, x.T @ (strength * data.e))
+        r = data.e - x @ beta
+        unsure = (1 - m**2) * (n[:, :2] @ beta[2:4]) ** 2 if directed else 0.0
+        r2 = r**2 + unsure
+        own = noise**2 + data.variance
+        weight = (FREEDOM + 1) / (FREEDOM + r2 / own)
+        noise = max(float(np.sqrt(np.average(np.maximum(r2 * weight - data.variance, 0)))), QUIET)
+    own = noise**2 + data.variance
+    student = -0.5 * (FREEDOM + 1) * np.log1p(r2 / own / FREEDOM) - 0.5 * np.log(own)
+    direction = np.zeros(4)
+    direction[:k] = beta[:k]
+    penalty = 0.5 * float((beta[k:] ** 2).sum()) / REMAINDER_SPREAD**2
+    return Light(direction, beta[k:], noise, weight, float(student.sum()) - penalty)
+
+
+def pull(data: Shading, light: Light) -> Float:
+    """The linear field h (M,) on the signs: log odds of + over − are 2 h."""
+    n = data.normal
+    swing = n[:, :2] @ light.direction[2:]
+    rest = data.e - light.direction[0] - light.direction[1] * n[:, 2] - data.basis @ light.remainder
+    return light.weight * swing * rest / (light.noise**2 + data.variance)
+
+
+def aligned(data: Shading, azimuth: float) -> Float:
+    """Signs (M,) of a surface lit from that azimuth, where brighter than the slant explains means facing the light."""
+    null = fit(data, np.zeros(len(data.e)), directed=False)
+    n = data.normal
+    rest = data.e - null.direction[0] - null.direction[1] * n[:, 2] - data.basis @ null.remainder
+    return np.where(rest * (n[:, 0] * np.cos(azimuth) + n[:, 1] * np.sin(azimuth)) < 0, -1.0, 1.0)
