@@ -103,8 +103,11 @@ def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any])
             file.attrs[name] = str(meta[name])
         for name in ("keys", "versions"):
             file.attrs[name] = json.dumps(meta[name], sort_keys=True)
+        sizes: dict[str, int] = {}
         for name, array in _collect(arrays).items():
             entry = SCHEMA[name]
+            if not _fits(entry, np.shape(array), sizes):
+                raise ValueError(f"{name} has shape {np.shape(array)}, expected {entry.axes} with {sizes}")
             dataset = _create(file, name, array, entry.dtype)
             dataset.attrs["axes"] = entry.axes
             dataset.attrs["unit"] = entry.unit
@@ -126,8 +129,19 @@ def _collect(arrays: Mapping[str, Any]) -> Arrays:
     data["instances/irradiance"] = irradiance["instance/irradiance"]
     data |= {f"textons/{n}": a for n, a in _stack(frontal).items()}
     data["textons/instances"] = np.bincount(surface["instance/texton"], minlength=len(frontal))
-    data["textons/class_scale"] = irradiance["class_scale"]
+    # The irradiance stage sees the textons that entered the surface alone; those after the last of them are missing.
+    scale = irradiance["class_scale"]
+    data["textons/class_scale"] = np.pad(scale, (0, max(0, len(frontal) - len(scale))), constant_values=np.nan)
     return data
+
+
+def _fits(entry: Entry, shape: tuple[int, ...], sizes: dict[str, int]) -> bool:
+    """Whether a shape has the entry's axes, each as long as in `sizes`, to which axes met for the first time are added."""
+    axes = entry.axes.split()
+    if len(shape) != len(axes):
+        return False
+    known = [sizes.setdefault(a, int(a) if a.isdigit() else n) for a, n in zip(axes, shape, strict=True)]
+    return known == list(shape)
 
 
 def _stack(frontal: list[Arrays]) -> Arrays:
@@ -233,17 +247,12 @@ def _check_shapes(path: Path, datasets: Mapping[str, h5py.Dataset], max_bytes: i
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         entry = SCHEMA[name]
-        axes = entry.axes.split()
         kinds = "SO" if entry.dtype == "U" else {"f4": "f", "i4": "iu", "?": "b"}[entry.dtype]
-        if dataset.dtype.kind not in kinds or len(dataset.shape or ()) != len(axes):
-            raise InputError(
-                f"{path}: {name} is {dataset.dtype} {dataset.shape}, expected {entry.dtype} ({entry.axes})"
-            )
-        for axis, size in zip(axes, dataset.shape, strict=True):
-            if sizes.setdefault(axis, int(axis) if axis.isdigit() else size) != size:
-                raise InputError(
-                    f"{path}: {name} is {dataset.shape}, but its axes are {entry.axes} with {axis} = {sizes[axis]}"
-                )
+        shape = dataset.shape or ()
+        if dataset.dtype.kind not in kinds or not _fits(entry, shape, sizes):
+            known = ", ".join(f"{axis} = {sizes[axis]}" for axis in entry.axes.split() if axis in sizes)
+            expected = f"{entry.dtype} with axes {entry.axes} ({known})"
+            raise InputError(f"{path}: {name} is {dataset.dtype} {shape}, expected {expected}")
         total += dataset.size * dataset.dtype.itemsize
     if total > max_bytes:
         raise InputError(

@@ -74,6 +74,18 @@ def test_results_without_instances_or_textons_are_whole(tmp_path: Path, arrays: 
     assert result.instances["transform"].shape == (0, 2, 2) and result.textons["reason"].shape == (0,)
 
 
+def test_what_could_not_be_read_back_is_not_written(arrays: dict, meta: dict) -> None:
+    arrays["surface"]["instance/inlier"] = arrays["surface"]["instance/inlier"][:-1]
+    with pytest.raises(ValueError, match=r"instances/inlier has shape \(39,\), expected N"):
+        archive.encode(arrays, meta)
+
+
+def test_textons_beyond_the_last_used_one_have_no_class_scale(tmp_path: Path, arrays: dict, meta: dict) -> None:
+    arrays["irradiance"]["class_scale"] = np.array([1, 1.5], "f4")
+    (tmp_path / "r.h5").write_bytes(archive.encode(arrays, meta))
+    np.testing.assert_array_equal(archive.open_result(tmp_path / "r.h5").textons["class_scale"], [1, 1.5, np.nan])
+
+
 def test_perspective_results_give_their_camera(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.attrs["camera"], file.attrs["focal_px"], file.attrs["principal_point"] = "perspective", 900.0, [64.5, 44.5]
@@ -123,7 +135,7 @@ def _huge(file: h5py.File, folder: Path) -> None:
         (_replace("surface/height", _huge), r"declares \d+\.\d GiB"),
         (_replace("surface/height", lambda f, d: None), "surface/height is missing"),
         (_replace("surface/height", lambda f, d: np.zeros((90, 131), "f4")), r"surface/normals is .* W = 131"),
-        (_replace("instances/xy", lambda f, d: np.zeros((40, 3), "f4")), r"instances/xy .* axes are N 2"),
+        (_replace("instances/xy", lambda f, d: np.zeros((40, 3), "f4")), r"instances/xy .* axes N 2"),
         (_replace("surface/valid", lambda f, d: np.zeros((90, 130), "c8")), "surface/valid is complex64"),
     ],
 )
