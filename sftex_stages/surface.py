@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ Float = NDArray[np.float64]
 class Params(StageParams):
     """Parameters of the surface stage."""
 
+    method: Literal["collapsed", "em"] = Field(
+        "collapsed", description="Signs by the search with the surface integrated out, or by the paper's EM"
+    )
     min_inlier: float = Field(0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)")
     model_error: float = Field(0.03, gt=0, le=0.5, description="Error of pooled tensors that no averaging removes")
     nodes: int = Field(1500, ge=50, le=20000, description="Most nodes that the sign search pools the instances in")
@@ -103,7 +106,8 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     low, high = box[0] - 2 * spacing, box[1] + 2 * spacing
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
     data = search_data(instances, nodes, spacing, params)
-    candidates = sign_search.search(data, coarse, spacing, params.finalists)
+    find = sign_search.search if params.method == "collapsed" else sign_search.by_em
+    candidates = find(data, coarse, spacing, params.finalists)
     best = candidates[0]
     fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy)
     start = gaussian.gradients(coarse, best.a)
@@ -159,10 +163,12 @@ def outputs(
     index, p = spline.stencil(field.grid, instances.xy, 1, 0)
     stencil = np.stack((p, spline.stencil(field.grid, instances.xy, 0, 1)[1]), 1)
     g = np.einsum("npk,nk->np", stencil, solution.a[index])
-    spread = support.covariance_at(field.grid, solution.factor, instances.xy)
+    spread = support.EXCESS * support.covariance_at(field.grid, solution.factor, instances.xy)
+    spread += tensors.common_error(g, instances.calibration.common)
     state = posterior_states(instances, g, spread)
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
-    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing)
+    common = instances.calibration.common
+    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing, common)
     valid = maps["supported"] & mask
     nan = np.float32(np.nan)
     height = maps["height"] - (maps["height"][valid].mean() if valid.any() else 0.0)

@@ -14,13 +14,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, shading, signs
+from sftex_stages.geometry import blocks, gaussian, shading, signs, surface_em
 from sftex_stages.geometry.refine import climb
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 LADDER = ((3.0, 8.0), (1.0, 4.0), (1.0, 2.0), (1.0, 0.7))  # strength, reach in spacings of nodes
+EM_SPACING = 1.5  # of the radial functions, in spacings of nodes
 ANNEAL_STEPS, LIGHT_EVERY = 24, 6
 OUTLIER = 0.05  # prior share of nodes that are not from the surface
 SAY_OF_SHADING = 0.5  # of its log likelihood: what one light does not explain is correlated between neighbours
@@ -233,6 +234,20 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
     first.sort(key=lambda x: -x.evidence)
     last = [judge(data, f, x.s, x.smooth, x.noise, 2, x.origin) for x in first[:finalists]]
     return sorted(last, key=lambda x: -x.evidence)
+
+
+def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list[Candidate]:
+    """The signs that the paper's EM finds from a cylinder in four directions (it was aligned by hand), judged alike."""
+    smooth = gaussian.Smoothness(1.0, 2.0 * spacing)
+    found = []
+    for k in range(4):
+        start = surface_em.cylinder(data.xy, k * np.pi / 4)
+        result = surface_em.run(
+            data.xy, data.d, data.covariance, data.log_outlier, start, EM_SPACING * spacing
+        )
+        s = np.where(result.state[:, 0] < result.state[:, 1], -1.0, 1.0)
+        found.append(judge(data, f, s, smooth, 1.0, 1, f"em, cylinder {45 * k}°"))
+    return sorted(found, key=lambda x: -x.evidence)[:finalists]
 
 
 def shortlist(

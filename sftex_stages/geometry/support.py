@@ -3,36 +3,52 @@
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
 from sftex_stages.geometry import blocks, gaussian, spline, tensors
 
 Float = NDArray[np.float64]
 
-REACH = 1.5  # local spacings of instances that a measurement speaks for
+GAPS = 2.2  # reach of a measurement, in the typical (upper quartile) distance of a point from its nearest measurement
+EXCESS = 2.0  # of the variance: neighbouring instances share errors that the posterior counts as independent
 WORST = 20.0  # degrees; a normal less certain than this is not reported
 
 
-def local_spacing(xy: Float, spacing: float) -> Float:
-    """Distance (N,) to the third neighbour, within a factor of two of the mean `spacing`: larger where instances are rare."""
-    near = cKDTree(xy).query(xy, min(4, len(xy)))[0][:, -1]
-    return np.clip(near, 0.5 * spacing, 2 * spacing)
+def typical_gap(xy: Float, spacing: float) -> float:
+    """Upper quartile of the distance from the nearest of `xy` (N, 2), over the convex hull of them, px."""
+    if len(xy) < 4:
+        return spacing
+    low, high = xy.min(0), xy.max(0)
+    axes = [np.linspace(low[k], high[k], 60) for k in range(2)]
+    points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    hull = xy[ConvexHull(xy, qhull_options="QJ").vertices]
+    inside = Delaunay(hull, qhull_options="QJ").find_simplex(points) >= 0
+    if not inside.any():
+        return spacing
+    return float(np.quantile(cKDTree(xy).query(points[inside])[0], 0.75))
 
 
-def supported(xy: Float, spacing: float, at: Float) -> Float:
-    """Distance (P,) of points `at` (P, 2) from the nearest instance, in that instance's reach; ≤ 1 is supported."""
-    reach = REACH * local_spacing(xy, spacing)
-    distance, near = cKDTree(xy).query(at, min(6, len(xy)))
-    distance, near = distance.reshape(len(at), -1), near.reshape(len(at), -1)
-    return (distance / reach[near]).min(1)
+def distance(seen: Float, at: Float) -> Float:
+    """Distance (P,) px of points `at` (P, 3) = (x, y, h) from the nearest of `seen` (N, 3), along the surface.
+
+    In space rather than in the image: toward a rim an image pixel is a long way on the surface, and what is seen of the
+    next element there says little about it.
+    """
+    return np.asarray(cKDTree(seen).query(at)[0])
 
 
 def dense(
-    f: gaussian.Field, a: Float, factor: blocks.Factor, shape: tuple[int, int], xy: Float, spacing: float
+    f: gaussian.Field,
+    a: Float,
+    factor: blocks.Factor,
+    shape: tuple[int, int],
+    xy: Float,
+    spacing: float,
+    common: float,
 ) -> dict[str, NDArray]:
     """Maps of an image of `shape` (H, W): `height` px, `normals` (H, W, 3), `sigma` degrees, `supported`.
 
-    Height and gradient are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster
+    `xy` (N, 2) are the measurements believed, `common` the error of w they share (`calibration.py`). Height and gradient are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster
     and interpolated.
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
@@ -41,9 +57,13 @@ def dense(
     at_x, at_y = (np.linspace(0, n - 1, max(int(np.ceil((n - 1) / pace)) + 1, 2)) for n in (shape[1], shape[0]))
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
     slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
-    spread = covariance_at(f.grid, factor, points)
+    spread = EXCESS * covariance_at(f.grid, factor, points) + tensors.common_error(slope, common)
     sigma = np.degrees(tensors.angular_error(slope, spread)).reshape(len(at_y), len(at_x))
-    far = supported(xy, spacing, points).reshape(sigma.shape)
+    height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
+    index, stencil = spline.stencil(f.grid, xy)
+    seen = np.concatenate((xy, (stencil * a[index]).sum(1, keepdims=True)), 1)
+    reach = GAPS * max(typical_gap(xy, spacing), 0.4 * spacing)
+    far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {
         "height": spline.evaluate(f.grid, a, columns, rows),

@@ -55,6 +55,12 @@ def gradient(w: Float, covariance: Float) -> tuple[Float, Float]:
     return direction * slope(size)[:, None], inverse @ covariance @ np.swapaxes(inverse, 1, 2)
 
 
+def common_error(g: Float, common: float) -> Float:
+    """Covariance (N, 2, 2) of gradients `g` (N, 2) that an error of w with that standard deviation causes."""
+    w, _ = predict(g)
+    return gradient(w, np.broadcast_to(common**2 * np.eye(2), (len(g), 2, 2)))[1]
+
+
 def normals(g: Float) -> Float:
     """Unit normals (…, 3) ∝ (−p, −q, 1) of gradients (…, 2)."""
     n = np.concatenate((-g, np.ones_like(g[..., :1])), -1)
