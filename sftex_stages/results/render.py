@@ -34,7 +34,7 @@ def render(
     normals: np.ndarray,
     valid: np.ndarray,
     textures: Sequence[np.ndarray | None] = (None,),
-    azimuth: float = 35.0,
+    azimuth: float = -35.0,
     elevation: float = 20.0,
     size: int = 840,
 ) -> list[np.ndarray]:
@@ -167,7 +167,7 @@ def _visible(
 def _shade(normals: np.ndarray, valid: np.ndarray, view: _View, px: np.ndarray, py: np.ndarray) -> np.ndarray:
     """Grey of a matt surface lit from the viewer's upper left, from the viewer and from the sky, (h, w, 3) uint8."""
     field = np.where(valid[..., None], normals, 0).astype(np.float32)
-    light = -0.62 * view.right - 0.55 * view.down + 0.75 * view.near
+    light = -0.45 * view.right - 0.45 * view.down + 0.9 * view.near
     light /= np.linalg.norm(light)
     # The three cosines that matter, looked up instead of the normal; its length, under 1 in between, divides out.
     axes = np.stack([light, view.down, view.near], 1).astype(np.float32)
@@ -176,7 +176,7 @@ def _shade(normals: np.ndarray, valid: np.ndarray, view: _View, px: np.ndarray, 
     front = cosines[..., 2] >= 0
     sign = np.where(front, 1, -1) / np.maximum(length, np.float32(1e-6))
     diffuse = np.maximum(cosines[..., 0] * sign, 0)
-    linear = (0.06 + 0.58 * diffuse + 0.16 * cosines[..., 2] * sign - 0.04 * cosines[..., 1] * sign) * np.where(
+    linear = (0.03 + 0.58 * diffuse + 0.08 * cosines[..., 2] * sign - 0.04 * cosines[..., 1] * sign) * np.where(
         front, 1, 0.45
     )
     return cv2.merge([to_display(linear.astype(np.float32), 1.0)] * 3)
