@@ -176,9 +176,8 @@ def _shade(normals: np.ndarray, valid: np.ndarray, view: _View, px: np.ndarray, 
     front = cosines[..., 2] >= 0
     sign = np.where(front, 1, -1) / np.maximum(length, np.float32(1e-6))
     diffuse = np.maximum(cosines[..., 0] * sign, 0)
-    linear = (0.03 + 0.58 * diffuse + 0.08 * cosines[..., 2] * sign - 0.04 * cosines[..., 1] * sign) * np.where(
-        front, 1, 0.45
-    )
+    down, near = cosines[..., 1] * sign, cosines[..., 2] * sign
+    linear = (0.03 + 0.58 * diffuse + 0.08 * near - 0.04 * down) * np.where(front, 1, 0.45)
     return cv2.merge([to_display(linear.astype(np.float32), 1.0)] * 3)
 
 
