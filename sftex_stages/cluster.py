@@ -19,16 +19,17 @@ Array = NDArray[np.floating]
 class Params(StageParams):
     """Parameters of `cluster`."""
 
-    clusters: int | None = Field(None, ge=1, le=5000, description="number of clusters; null: from the number of points")
+    clusters: int | None = Field(None, ge=1, le=5000, description="clusters of points and of regions; null: from their numbers")
     points_per_cluster: float = Field(80.0, ge=3, description="sets the number of clusters when it is not given")
-    max_distance: float = Field(1.6, gt=0, description="members farther from the centre than this × the median distance are left out")
+    regions_per_cluster: float = Field(150.0, ge=3, description="the same for regions, whose frames are affine already")
+    max_distance: float = Field(1.6, gt=0, description="members farther from the centre, in median distances, are left out")
     max_scale_ratio: float = Field(2.0, gt=1, description="members whose size differs from the median by more are left out")
     seed: int = Field(0, ge=0, description="seed of k-means")
 
 
-def number_of_clusters(points: int, params: Params) -> int:
-    """k for `points` descriptors."""
-    wanted = params.clusters if params.clusters is not None else round(points / params.points_per_cluster)
+def number_of_clusters(points: int, per_cluster: float, params: Params) -> int:
+    """k for `points` descriptors of one kind."""
+    wanted = params.clusters if params.clusters is not None else round(points / per_cluster)
     return int(np.clip(wanted, 1, max(1, points // 3)))
 
 
@@ -37,20 +38,33 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     from sklearn.cluster import KMeans  # takes over a second to import, and a cached run does not need it
 
     detect = inputs["detect"]
-    descriptors = detect["descriptor"].astype(np.float32)
-    k = number_of_clusters(len(descriptors), params)
-    means = KMeans(k, n_init=1, max_iter=60, random_state=params.seed, algorithm="lloyd").fit(descriptors)
-    label = means.labels_.astype(np.int32)
-    distance = np.linalg.norm(descriptors - means.cluster_centers_[label], axis=1)
+    kind = detect["kind"]
     size = np.log(np.sqrt(np.abs(np.linalg.det(detect["frame"].astype(np.float64)))))
-    for c in range(k):
-        members = np.flatnonzero(label == c)
-        if len(members) == 0:
+    label = np.full(len(kind), -1, np.int32)
+    count = 0
+    for which, share in ((0, params.points_per_cluster), (1, params.regions_per_cluster)):
+        rows = np.flatnonzero(kind == which)
+        if len(rows) < 3:
             continue
+        k = number_of_clusters(len(rows), share, params)
+        descriptors = detect["descriptor"][rows].astype(np.float32)
+        means = KMeans(k, n_init=1, max_iter=60, random_state=params.seed, algorithm="lloyd").fit(descriptors)
+        distance = np.linalg.norm(descriptors - means.cluster_centers_[means.labels_], axis=1)
+        label[rows] = count + means.labels_
+        label[rows[outlying(means.labels_, distance, size[rows], params)]] = -1
+        count += k
+    return {"label": label, "count": np.array(count, np.int64)}
+
+
+def outlying(label: Array, distance: Array, size: Array, params: Params) -> Array:
+    """Members (N,) bool far from their cluster's centre in descriptor, or from its median in log size."""
+    out = np.zeros(len(label), bool)
+    order = np.argsort(label, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
         far = distance[members] > params.max_distance * np.median(distance[members])
         odd = np.abs(size[members] - np.median(size[members])) > np.log(params.max_scale_ratio)
-        label[members[far | odd]] = -1
-    return {"label": label, "count": np.int64(k)}
+        out[members] = far | odd
+    return out
 
 
 STAGE = Stage(name="cluster", version=1, params=Params, run=run, inputs=("detect",))

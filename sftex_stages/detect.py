@@ -1,4 +1,4 @@
-"""Stage `detect`: interest points and their descriptors (Lobay & Forsyth 2006, sections 1.3 and 3).
+"""Stage `detect`: interest points, regions and their descriptors (Lobay & Forsyth 2006, sections 1.3 and 3).
 
 Interest points are Lowe's (SIFT), on the display-encoded image, where dark folds keep their contrast. Small images are
 enlarged first: the elements of printed cloth are 10–40 px wide, and the finest of them live below SIFT's first octave.
@@ -14,6 +14,7 @@ from pydantic import Field
 
 from .engine.stage import Arrays, Stage, StageParams
 from .errors import StageError
+from .geometry.regions import find_regions, orient_and_describe
 
 Array = NDArray[np.floating]
 
@@ -24,6 +25,8 @@ class Params(StageParams):
     min_megapixels: float = Field(1.2, ge=0, le=16, description="smaller images are enlarged to this size, at most twofold")
     contrast_threshold: float = Field(0.01, gt=0, lt=1, description="SIFT contrast threshold; lower finds fainter points")
     edge_threshold: float = Field(10.0, gt=1, description="SIFT edge threshold; higher keeps points on edges")
+    regions: bool = Field(True, description="find affine-covariant regions beside interest points")
+    region_contrast: float = Field(0.5, gt=0, lt=5, description="contrast of a region, in deviations of its surroundings")
     max_keypoints: int = Field(60_000, ge=10, description="the strongest are kept")
 
 
@@ -38,15 +41,18 @@ def encode(rgb: Array) -> Array:
     return np.round(255 * coded).astype(np.uint8)
 
 
-def interest_points(grey: Array, mask: Array, params: Params) -> tuple[Array, Array, Array]:
+def enlarge(grey: Array, min_megapixels: float) -> tuple[Array, Array]:
+    """The image at `min_megapixels` or its own size, and the factors (2,) in x and y."""
+    factor = float(np.clip(np.sqrt(min_megapixels * 1e6 / grey.size), 1.0, 2.0))
+    if factor <= 1.05:
+        return grey, np.ones(2)
+    size = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
+    scale = np.array([size[0] / grey.shape[1], size[1] / grey.shape[0]])
+    return cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC), scale
+
+
+def interest_points(enlarged: Array, scale: Array, mask: Array, params: Params) -> tuple[Array, Array, Array]:
     """SIFT keypoints of an 8-bit image: xy (N, 2), frames (N, 2, 2) = σ R(orientation), RootSIFT (N, 128)."""
-    factor = float(np.clip(np.sqrt(params.min_megapixels * 1e6 / grey.size), 1.0, 2.0))
-    if factor > 1.05:
-        size = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
-        enlarged = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
-        scale = np.array([size[0] / grey.shape[1], size[1] / grey.shape[0]])
-    else:
-        enlarged, scale = grey, np.ones(2)
     sift = cv2.SIFT_create(
         nfeatures=params.max_keypoints, contrastThreshold=params.contrast_threshold, edgeThreshold=params.edge_threshold
     )
@@ -67,24 +73,41 @@ def interest_points(grey: Array, mask: Array, params: Params) -> tuple[Array, Ar
     return xy[order], frames[order], root[order].astype(np.float32)
 
 
+def regions(enlarged: Array, scale: Array, mask: Array, params: Params) -> tuple[Array, Array, Array]:
+    """Affine-covariant regions: xy (N, 2), frames (N, 2, 2) from the unit disc, RootSIFT of the normalised patch (N, 128)."""
+    if not params.regions:
+        return np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 128), np.float32)
+    longest = max(enlarged.shape)
+    windows = tuple(round(longest / d) | 1 for d in (8, 16, 32))
+    size = (enlarged.shape[1], enlarged.shape[0])
+    allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    xy, frames = find_regions(enlarged, allowed, windows, params.region_contrast, smallest=3.0)
+    frames, descriptors = orient_and_describe(enlarged, xy, frames)
+    return (xy + 0.5) / scale - 0.5, frames / scale.mean(), descriptors
+
+
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
-    """Detect interest points. Input `image` {rgb (H, W, 3), mask (H, W)}.
+    """Detect interest points and regions. Input `image` {rgb (H, W, 3), mask (H, W)}.
 
     Returns `xy` (N, 2) px, `frame` (N, 2, 2) unit disc of the element → px, `descriptor` (N, 128), `kind` (N,) 0 for
-    interest points. Raises StageError when there are fewer than three: nothing can repeat.
+    interest points, 1 for regions. Raises StageError when there are fewer than three: nothing can repeat.
     """
     image = inputs["image"]
-    xy, frames, descriptors = interest_points(encode(image["rgb"]), image["mask"], params)
+    mask = image["mask"]
+    enlarged, scale = enlarge(encode(image["rgb"]), params.min_megapixels)
+    points = interest_points(enlarged, scale, mask, params)
+    blobs = regions(enlarged, scale, mask, params)
+    xy, frames, descriptors = (np.concatenate(both) for both in zip(points, blobs, strict=True))
     if len(xy) < 3:
         raise StageError(
-            f"only {len(xy)} interest points found: the image (or its mask) shows no texture; "
+            f"only {len(xy)} interest points and regions found: the image (or its mask) shows no texture; "
             "use a sharper or larger image, widen the mask, or lower detect.contrast_threshold"
         )
     return {
         "xy": xy.astype(np.float32),
         "frame": frames.astype(np.float32),
         "descriptor": descriptors,
-        "kind": np.zeros(len(xy), np.uint8),
+        "kind": np.repeat(np.array([0, 1], np.uint8), [len(points[0]), len(blobs[0])]),
     }
 
 

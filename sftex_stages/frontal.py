@@ -9,13 +9,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from .engine.stage import Arrays, Stage, StageParams
-from .geometry.imaging import normal_of_tensor, singular_values, tensor_of
-from .geometry.metric import common_covariance, metric_covariance, metric_upgrade, project_tensors
-from .geometry.registration import make_template, patch_grid, register, sample
+from .geometry.imaging import normal_of_tensor, tensor_of
+from .geometry.metric import (
+    common_covariance,
+    constraint_gap,
+    metric_covariance,
+    metric_upgrade,
+    noise_split,
+    project_tensors,
+)
+from .geometry.registration import patch_grid, register, sample
 from .geometry.texton import (
-    PROGRESS,
     Estimate,
     Settings,
+    circle_of,
     estimate_texton,
     independent_samples,
     information_centre,
@@ -28,12 +35,14 @@ from .geometry.texton import (
 )
 
 Array = NDArray[np.floating]
+Indices = NDArray[np.integer]
 
 
 class Params(StageParams):
     """Parameters of `frontal`."""
 
     radius: float = Field(4.5, gt=1, le=20, description="radius of the first domain, in sizes (σ) of the interest point")
+    region_radius: float = Field(1.6, gt=1, le=5, description="radius of the first domain, in radii of the region")
     max_growth: float = Field(2.2, ge=1, le=5, description="the domain may grow to this multiple of the first radius")
     iterations: int = Field(20, ge=5, le=100, description="EM iterations")
     affine_iterations: int = Field(6, ge=1, le=50, description="of which with free affine frames")
@@ -42,10 +51,12 @@ class Params(StageParams):
     noise_floor: float = Field(0.01, gt=0, lt=1, description="texton noise that no agreement undercuts, in units of contrast")
     trend_order: int = Field(1, ge=0, le=2, description="order of the polynomial trend of log scale (perspective)")
     max_metric_residual: float = Field(0.03, gt=0, description="a texton above is unusable")
+    max_metric_error: float = Field(0.1, gt=0, description="a texton whose stretch is known less well is unusable")
     max_sigma: float = Field(8.0, gt=0, description="a texton whose typical normal error is larger (degrees) is unusable")
 
 
-_MEMO: dict[str, Any] = {}
+_CIRCLE_SLACK = 4.0  # one size is all that a circle's upgrade fits, so that scattered sizes say less against it
+_MEMO: dict[Any, Any] = {}  # the pyramid of the image in hand, shared by the jobs that one worker runs
 
 
 def level_image(rgb: Array, level: int) -> Array:
@@ -69,15 +80,16 @@ def empty(reason: str) -> Arrays:
     """The artefact of a texton that could not be estimated."""
     none = np.zeros((0,), np.float32)
     return {
-        "usable": np.bool_(False),
-        "reason": np.str_(reason),
+        "usable": np.array(False),
+        "reason": np.array(reason),
         "appearance": np.zeros((0, 0, 3), np.float32),
         "domain": np.zeros((0, 0), np.float32),
-        "spacing": np.float32(0),
+        "spacing": np.array(0, np.float32),
         "progress": np.zeros((0, 0, 0, 3), np.float32),
         "progress_iterations": np.zeros(0, np.int32),
-        "metric_residual": np.float32(np.nan),
-        "information": np.float32(0),
+        "metric_residual": np.array(np.nan, np.float32),
+        "information": np.array(0, np.float32),
+        "circular": np.array(False),
         "index": np.zeros(0, np.int32),
         "xy": np.zeros((0, 2), np.float32),
         "transform": np.zeros((0, 2, 2), np.float32),
@@ -102,13 +114,14 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     xy0, frames0 = detect["xy"][members].astype(np.float64), detect["frame"][members].astype(np.float64)
 
     # one grid point is about one pixel of the pyramid level on which the first domain is 8 to 13 points in radius
-    size = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0))))) * params.radius
+    radius = params.region_radius if detect["kind"][members[0]] else params.radius
+    size = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0))))) * radius
     level = int(np.clip(np.ceil(np.log2(size / 9.0)), -1, 5))
     image = level_image(rgb, level)
     factor = 2.0**-level
     half = int(np.clip(round(size * factor), 6, 9))
     xy = (xy0 + 0.5) * factor - 0.5
-    frames = frames0 * (params.radius * factor / half)
+    frames = frames0 * (radius * factor / half)
     extent = np.array([rgb.shape[1], rgb.shape[0]], float)
     where0 = (2 * xy0 - extent) / extent.max()
 
@@ -116,7 +129,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     few = np.sort(rng.permutation(len(members))[: params.subset])
     settings = Settings(
         half=half,
-        half_limit=int(round(half * params.max_growth)),
+        half_limit=round(half * params.max_growth),
         iterations=params.iterations,
         affine_iterations=min(params.affine_iterations, params.iterations),
         noise_floor=params.noise_floor,
@@ -130,7 +143,15 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
 
 
 def finish(
-    image: Array, texton: Estimate, xy: Array, frames: Array, where: Array, members: Array, few: Array, factor: float, params: Params
+    image: Array,
+    texton: Estimate,
+    xy: Array,
+    frames: Array,
+    where: Array,
+    members: Indices,
+    few: Indices,
+    factor: float,
+    params: Params,
 ) -> Arrays:
     """Register all members to the finished texton and report them with their uncertainties."""
     template = texton.template
@@ -153,20 +174,20 @@ def finish(
     if inlier.sum() < 2.5:
         return empty("its patches do not agree with their mean")
     order = params.trend_order if inlier.sum() >= 12 else 0
-    upgrade = metric_upgrade(got.frames, where, inlier + 1e-6, order)
+    circle = circle_of(template)
+    upgrade = metric_upgrade(got.frames, where, inlier + 1e-6, order, circle=circle)
     frames_ = got.frames @ np.linalg.cholesky(upgrade.gram)
     scale = np.exp(upgrade.log_scale)
     tensor = tensor_of(frames_, scale)
     own = tensor_covariance(frames_, scale, strain_covariance(template, residual))
-    _, _, chi2 = project_tensors(tensor, own)
-    good = inlier > 0.5
-    # the model's own distance from the manifold sets the unit of every covariance
-    unit = float(max(np.median(chi2[good]) / 0.455, 1.0)) if good.sum() >= 5 else 10.0
-    chi2 = chi2 / unit
-    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual)
+    gap, spread = constraint_gap(tensor, own)
+    factor_, scale_var = noise_split(gap, spread, inlier)
+    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, circle is not None)
     common = common_covariance(frames_, where, scale, order, metric_cov)
-    cov = own * unit + common
-    projected, left, _ = project_tensors(tensor, cov)
+    cov = own * factor_ + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
+    projected, left, chi2 = project_tensors(tensor, cov)
+    # what is left of the departure from the trend after the registration's noise is the local scale's
+    scale = scale * np.exp(0.5 * gap * scale_var / (scale_var + factor_ * spread))
     inlier = inlier * np.where(chi2 < 12.0, 1.0, np.exp(-0.5 * (chi2 - 12.0)))
     transform = with_tensor(frames_, projected, scale)
     normal = normal_of_tensor(projected)
@@ -174,38 +195,40 @@ def finish(
     centre = got.xy + transform @ information_centre(template)
     inlier = inlier * unique(got.xy, residual, transform, template)
     good = inlier > 0.8
+    metric_error = float(np.sqrt(np.linalg.eigvalsh(metric_cov[:3, :3])[-1]))
     reason = ""
     typical = float(np.median(sigma[good])) if good.any() else np.inf
     if good.sum() < 3:
         reason = f"only {int(good.sum())} instances agree with it"
-    elif upgrade.residual > params.max_metric_residual:
+    elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circle is not None else 1.0):
         reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
+    elif metric_error > params.max_metric_error:
+        reason = f"its instances keep one direction of the element and do not fix its stretch (error {metric_error:.2f})"
     elif typical > params.max_sigma:
         reason = f"it says too little about slant and tilt (expected error {typical:.1f} degrees)"
-    out_scale = scale
     return {
-        "usable": np.bool_(reason == ""),
-        "reason": np.str_(reason),
+        "usable": np.array(reason == ""),
+        "reason": np.array(reason),
         "appearance": texton.values.astype(np.float32),
         "domain": texton.weights.astype(np.float32),
-        "spacing": np.float32(1.0 / factor),
+        "spacing": np.array(1.0 / factor, np.float32),
         "progress": progress(image, texton),
         "progress_iterations": np.array([h[0] for h in texton.history], np.int32),
-        "metric_residual": np.float32(upgrade.residual),
-        "information": np.float32(np.sqrt(np.trace(metric_cov[:3, :3]))),
+        "metric_residual": np.array(upgrade.residual, np.float32),
+        "information": np.array(metric_error, np.float32),
+        "circular": np.array(circle is not None),
         "index": members.astype(np.int32),
         "xy": ((centre + 0.5) / factor - 0.5).astype(np.float32),
         "transform": transform.astype(np.float32),
-        "scale": out_scale.astype(np.float32),
+        "scale": scale.astype(np.float32),
         "tensor": tensor.astype(np.float32),
         "tensor_cov": cov.astype(np.float32),
-        "log_scale_sigma": np.sqrt(cov[:, [0, 2], [0, 2]].mean(1) / 4).astype(np.float32),
+        "log_scale_sigma": (0.5 * np.sqrt(factor_ * spread)).astype(np.float32),
         "normal": normal.astype(np.float32),
         "normal_sigma": sigma.astype(np.float32),
         "inlier": inlier.astype(np.float32),
         "irradiance": got.gain.astype(np.float32),
         "irradiance_sigma": np.sqrt(residual / max(float((template.values**2).mean()), 1e-12) / samples).astype(np.float32),
-       
     }
 
 

@@ -68,7 +68,7 @@ def make_template(values: Array, weights: Array, spacing: float) -> Template:
 class Solver(NamedTuple):
     """The part of a registration step that depends on the template alone."""
 
-    used: Array  # (P,) bool, points with weight
+    used: NDArray[np.bool_]  # (P,), points with weight
     root: Array  # (P',) √w there
     basis: Array  # (P'·C, 7) float32
     unit: Array  # (6,) radius for shifts, 1 for strains: one damping serves both
@@ -136,7 +136,13 @@ class Registered(NamedTuple):
 
 
 def register(
-    image: Array, template: Template, xy: Array, frames: Array, steps: int, damping: float = 1e-3, limit: float = 0.35
+    image: Array,
+    template: Template,
+    xy: Array,
+    frames: Array,
+    steps: int,
+    damping: float = 1e-3,
+    limit: float = 0.35,
 ) -> Registered:
     """Affine registration of M patches to a template, the gain solved for.
 

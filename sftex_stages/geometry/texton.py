@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .imaging import tensor_of
-from .metric import gram_lift, leading_eigenpair, metric_upgrade, project_tensors
+from .metric import circle_metric, gram_lift, leading_eigenpair, metric_upgrade, project_tensors
 from .registration import Template, compose_step, make_template, marginal_hessian, patch_grid, registration_step, sample
 
 Array = NDArray[np.floating]
@@ -103,7 +103,7 @@ def domain_weights(values: Array, var: Array, half: int, floor: float, agreement
     image = cv2.GaussianBlur(var.reshape(n, n).astype(np.float32), (0, 0), 0.8).ravel()
     agree = window & (image < agreement * max(contrast2, base))
     mask = agree.reshape(n, n).astype(np.uint8)
-    count, labels = cv2.connectedComponents(mask, connectivity=4)
+    _, labels = cv2.connectedComponents(mask, connectivity=4)
     core = slice(half - max(1, half // 4), half + max(1, half // 4) + 1)
     touching = np.unique(labels[core, core])
     keep = np.isin(labels, touching[touching > 0]).ravel()
@@ -159,7 +159,8 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             return None
         xy, frames = compose_step(xy, frames, step)
         if iteration >= settings.affine_iterations:
-            upgrade = metric_upgrade(frames, where, inlier + 1e-6, settings.trend_order if len(xy) >= 12 else 0, warm=held)
+            order = settings.trend_order if len(xy) >= 12 else 0
+            upgrade = metric_upgrade(frames, where, inlier + 1e-6, order, warm=held, circle=circle_of(template))
             held = True
             frames, scale = frames @ np.linalg.cholesky(upgrade.gram), np.exp(upgrade.log_scale)
             frames = hold_to_manifold(frames, scale, template, residual)
@@ -179,10 +180,26 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         if (weights > 0).sum() < 9:
             return None
     template = make_template(values.reshape(n, n, -1), weights, 1.0)
-    return Estimate(template, values.reshape(n, n, -1), weights, half, xy, frames, inlier, float(np.sqrt(noise2)), prior, history)
+    noise = float(np.sqrt(noise2))
+    return Estimate(template, values.reshape(n, n, -1), weights, half, xy, frames, inlier, noise, prior, history)
 
 
 _DAMPING = 1e-3
+_CIRCLE = 0.03  # a turn that costs less than this share of the next strain is none
+
+
+def circle_of(template: Template) -> Array | None:
+    """M (2, 2) up to size for a circular element (section 2.2.2), None for any other."""
+    ratio, gram = circle_metric(marginal_strain(template))
+    if gram is None or ratio > _CIRCLE or np.linalg.cond(gram) > 6:
+        return None  # a long ellipse is an edge or a line rather than a tilted disc
+    return gram
+
+
+def marginal_strain(template: Template) -> Array:
+    """(4, 4) Hessian of the strain with gain and shift solved for."""
+    h = marginal_hessian(template)
+    return h[:4, :4] - h[:4, 4:] @ np.linalg.solve(h[4:, 4:] + 1e-9 * np.trace(h[4:, 4:]) * np.eye(2), h[4:, :4])
 
 
 def information_centre(template: Template) -> Array:
@@ -215,9 +232,9 @@ def strain_covariance(template: Template, residual: Array) -> Array:
     From the information of the template (its Hessian with gain and translation marginalised) and each instance's mean
     squared `residual` (M,). Neighbouring samples are not independent, and models are never exact: `calibrate` finds the factor.
     """
-    hessian = marginal_hessian(template)
-    ridge = 1e-6 * np.trace(hessian[:4, :4])
-    cov = np.linalg.inv(hessian + ridge * np.eye(6))[:4, :4]
+    hessian = marginal_strain(template)
+    # the ridge keeps the free turn of a circular element finite; the symmetric strain does not contain it
+    cov = np.linalg.inv(hessian + 1e-4 * np.trace(hessian) * np.eye(4))
     fold = np.array([[2.0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 2]])
     return residual[:, None, None] * (fold @ cov @ fold.T)
 
@@ -239,7 +256,7 @@ def hold_to_manifold(frames: Array, scale: Array, template: Template, residual: 
 def with_tensor(frames: Array, tensor: Array, scale: Array) -> Array:
     """The matrices nearest in rotation to `frames` whose T Tᵀ is s² `tensor`, the tensor clipped to valid slants."""
     mat = np.stack([tensor[:, 0], tensor[:, 1], tensor[:, 1], tensor[:, 2]], -1).reshape(-1, 2, 2)
-    l1, l2, u = leading_eigenpair(mat)
+    _, l2, u = leading_eigenpair(mat)
     v = np.stack([-u[:, 1], u[:, 0]], -1)
     minor = np.sqrt(np.clip(l2, 0.01, 1.0))
     root = u[:, :, None] * u[:, None, :] + minor[:, None, None] * v[:, :, None] * v[:, None, :]
