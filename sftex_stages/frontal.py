@@ -51,7 +51,7 @@ class Params(StageParams):
     noise_floor: float = Field(0.01, gt=0, lt=1, description="texton noise that no agreement undercuts, in units of contrast")
     trend_order: int = Field(1, ge=0, le=2, description="order of the polynomial trend of log scale (perspective)")
     max_metric_residual: float = Field(0.03, gt=0, description="a texton above is unusable")
-    max_metric_error: float = Field(0.1, gt=0, description="a texton whose stretch is known less well is unusable")
+    max_metric_error: float = Field(0.2, gt=0, description="a texton whose stretch is known less well is unusable")
     max_sigma: float = Field(8.0, gt=0, description="a texton whose typical normal error is larger (degrees) is unusable")
 
 

@@ -193,7 +193,8 @@ def metric_covariance(
     full = np.concatenate([squares / 2, -trend_basis(where, order)], 1)
     w = weights * _informs(frames, np.eye(2))
     effective = w.sum() ** 2 / max((w**2).sum(), 1e-12)
-    variance = max(residual, 2e-3) ** 2 * effective / max(effective - 3, 0.5)
+    # instances of one cluster share errors (a domain that is not flat, blur that goes with slant): a quarter of them count
+    variance = max(residual, 2e-3) ** 2 * 4 * effective / max(effective - 3, 0.5)
     # a circular element has one freedom, its size
     basis = np.eye(8) if not circular else np.vstack([[1.0, 0, 1, 0, 0, 0, 0, 0], np.eye(8)[3:]])
     prior = np.diag(np.r_[np.full(len(basis) - 5, 1.0), np.full(5, 1 / _TREND_SIGMA**2)])
@@ -240,7 +241,8 @@ def noise_split(gap: Array, variance: Array, weights: Array) -> tuple[float, flo
     # neighbouring samples are correlated, about ten to one independent: where the data cannot tell, that is the guess
     cost = loss.sum(-1) + 0.5 * (np.log(factors / 8) / 1.2)[:, None] ** 2
     at = np.unravel_index(int(cost.argmin()), cost.shape)
-    return float(factors[at[0]]), float(scales[at[1]])
+    # the variance of Student's t with 4 degrees of freedom is twice its squared scale
+    return 2 * float(factors[at[0]]), 2 * float(scales[at[1]])
 
 
 def project_tensors(tensor: Array, cov: Array, steps: int = 4) -> tuple[Array, Array, Array]:
