@@ -14,9 +14,13 @@ from sftex_stages.geometry import field, spline
 class Params(StageParams):
     """Parameters of the irradiance stage."""
 
-    min_inlier: float = Field(0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)")
+    min_inlier: float = Field(
+        0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)"
+    )
     noise_floor: float = Field(0.01, gt=0, le=1, description="Least relative error of an irradiance that is believed")
-    nodes: int = Field(2000, ge=50, le=20000, description="Most cells that instances are pooled in to find the smoothness")
+    nodes: int = Field(
+        2000, ge=50, le=20000, description="Most cells that instances are pooled in to find the smoothness"
+    )
     detail: float = Field(0.8, gt=0.2, le=4, description="Spacing of the field's grid, in spacings of those cells")
 
 

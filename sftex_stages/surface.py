@@ -13,7 +13,7 @@ from sftex_stages.errors import StageError
 from sftex_stages.geometry import calibration, gaussian, pooling, refine, shading, sign_search, spline, support, tensors
 from sftex_stages.geometry import field as irradiance_field
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 
 class Params(StageParams):
@@ -22,7 +22,9 @@ class Params(StageParams):
     method: Literal["collapsed", "em"] = Field(
         "collapsed", description="Signs by the search with the surface integrated out, or by the paper's EM"
     )
-    min_inlier: float = Field(0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)")
+    min_inlier: float = Field(
+        0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)"
+    )
     model_error: float = Field(0.03, gt=0, le=0.5, description="Error of pooled tensors that no averaging removes")
     nodes: int = Field(1500, ge=50, le=20000, description="Most nodes that the sign search pools the instances in")
     detail: float = Field(0.8, gt=0.2, le=4, description="Spacing of the surface's grid, in mean spacings of nodes")
@@ -37,7 +39,7 @@ class Instances:
     table: Arrays
     xy: Float
     trust: Float  # 0 below the threshold
-    texton: NDArray[np.int64]  # 0 … K − 1, used textons only
+    texton: NDArray[np.integer]  # 0 … K − 1, used textons only
     calibration: calibration.Calibration
     covariance: Float  # of w, (N, 2, 2)
 
@@ -50,8 +52,7 @@ def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
     StageError
         without a usable texton, or with fewer than three instances to believe in.
     """
-    names = ("xy", "transform", "tensor", "tensor_cov", "scale", "log_scale_sigma", "normal", "inlier")
-    names += ("irradiance", "irradiance_sigma")
+    names = ["xy", "transform", "tensor", "tensor_cov", "normal", "inlier", "irradiance", "irradiance_sigma"]
     parts = [(k, f) for k, f in enumerate(frontal) if bool(f["usable"]) and len(f["xy"])]
     if not parts:
         raise StageError(
@@ -75,7 +76,7 @@ def prepare(rows: Arrays, params: Params) -> Instances:
     xy = rows["xy"].astype(float)
     trust = np.where(rows["inlier"] > params.min_inlier, rows["inlier"], 0.0).astype(float)
     _, texton = np.unique(rows["texton"], return_inverse=True)
-    w, covariance = tensors.deviator(rows["tensor"].astype(float), rows["tensor_cov"].astype(float))
+    _, covariance = tensors.deviator(rows["tensor"].astype(float), rows["tensor_cov"].astype(float))
     result = calibration.calibrate(
         xy, rows["transform"].astype(float), covariance, texton, np.maximum(trust, 1e-6), params.model_error
     )
@@ -117,9 +118,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     return outputs(mask, instances, nodes, solution, fine, candidates, spacing)
 
 
-def search_data(
-    instances: Instances, nodes: pooling.Nodes, spacing: float, params: Params
-) -> sign_search.Data:
+def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, params: Params) -> sign_search.Data:
     """What the sign search is given: gradients up to sign, and irradiance on one scale."""
     d, covariance = tensors.gradient(nodes.w, nodes.covariance)
     log_outlier = -np.log(np.pi) + 0.5 * (np.linalg.slogdet(nodes.covariance)[1] - np.linalg.slogdet(covariance)[1])
@@ -191,6 +190,7 @@ def outputs(
         "candidate/shape": np.array([c.shape for c in candidates]),
         "candidate/shading": np.array([c.shade for c in candidates]),
         "candidate/origin": np.array([c.origin for c in candidates]),
+        "candidate/tuned": np.array([c.tuned for c in candidates]),
     }
 
 

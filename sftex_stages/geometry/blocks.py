@@ -13,8 +13,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, get_lapack_funcs
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+Float = NDArray[np.floating]
+Int = NDArray[np.integer]
 
 _pbtrf, _pbtrs, _trtri = get_lapack_funcs(("pbtrf", "pbtrs", "trtri"), dtype=np.float64)
 FEW = 2  # right-hand sides up to which the band is solved directly

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+Float = NDArray[np.floating]
+Int = NDArray[np.integer]
 
 NEIGHBOURS = 24
 SHEAR = 0.06  # standard deviation of e_k a priori: metric upgrades are off by a few per cent
@@ -93,8 +93,10 @@ def calibrate(
     foreign = texton[near] != texton[:, None]
     lonely = (foreign * (trust[near] > 0.1)).sum(1) < 4
     witness = np.where(foreign | lonely[:, None], 1.0, 0.0)
-    e, noise, robust = np.zeros((count, 2)), np.ones(count), np.ones(n)
-    current = w.copy()
+    e: Float = np.zeros((count, 2))
+    noise: Float = np.ones(count)
+    robust: Float = np.ones(n)
+    current: Float = w.copy()
     for _ in range(rounds):
         strength = trust * robust / (noise[texton] * variance)
         mean, spread = predict_from_neighbours(xy, current, witness * strength[near], near)
@@ -114,6 +116,6 @@ def calibrate(
         relative = trust * robust * ((mean - current) ** 2).sum(1) / (variance + spread) / 2
         mass = np.bincount(texton, trust, count)
         noise = (np.bincount(texton, relative, count) + MEMBERS) / (mass + MEMBERS)
-    mass = np.bincount(texton, trust, count) / noise
-    shared = COMMON_SHARE * np.sqrt(mass @ (e**2).sum(1) / 2 / mass.sum())
+    total = np.bincount(texton, trust, count) / noise
+    shared = COMMON_SHARE * np.sqrt(total @ (e**2).sum(1) / 2 / total.sum())
     return Calibration(e, noise, current, robust, float(np.hypot(COMMON_LEAST, shared)))

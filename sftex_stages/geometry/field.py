@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sftex_stages.geometry import blocks, gaussian, pooling, spline
 from sftex_stages.geometry.refine import climb
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+Float = NDArray[np.floating]
+Int = NDArray[np.integer]
 
 FREEDOM = 3.0  # of the Student distribution of the noise: highlights, elements half in a shadow
 SCALE_SPREAD = 3.0  # standard deviation of a texton's log scale; only keeps the system definite

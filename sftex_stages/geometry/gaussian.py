@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from sftex_stages.geometry import blocks, spline
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+Float = NDArray[np.floating]
+Int = NDArray[np.integer]
 
 HEIGHT_SCALE = 1.0  # standard deviation of the free constant of h, in extents
 SLOPE_SCALE = 3.0  # standard deviation of an overall lean; both make evidences of different priors comparable
@@ -41,7 +41,7 @@ class Scatter:
     def __call__(self, products: Float) -> Float:
         """Lower band storage of the sum of `products` (N, 16, 16)."""
         flat = np.bincount(self.position, products.ravel()[self.keep], (self.width + 1) * self.size)
-        return flat.reshape(self.size, self.width + 1).T
+        return flat.astype(float, copy=False).reshape(self.size, self.width + 1).T
 
     def pack(self, matrix: sp.spmatrix) -> Float:
         """The same storage for a sparse matrix."""
@@ -115,7 +115,7 @@ def pulled(f: Field, pull: Float) -> Float:
 
 def lifted(f: Field, pull: Float) -> Float:
     """The same (M,) for pulls (N,) on the heights."""
-    return np.bincount(f.index.ravel(), (pull[:, None] * f.value).ravel(), f.grid.size)
+    return np.bincount(f.index.ravel(), (pull[:, None] * f.value).ravel(), f.grid.size).astype(float, copy=False)
 
 
 def heights(f: Field, a: Float) -> Float:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+Float = NDArray[np.floating]
+Int = NDArray[np.integer]
 
 FREEDOM = 3.0
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sftex_stages.geometry import blocks, gaussian, tensors
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 FREEDOM = 4.0  # of the Student distribution; two dimensions
 NOISE_FACTORS = (0.05, 50.0)

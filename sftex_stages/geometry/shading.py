@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sftex_stages.geometry import spline
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 FREEDOM = 4.0
 REMAINDER_CELLS = 3  # along the longer side: u must not follow folds

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from sftex_stages.geometry import blocks, gaussian, shading, signs, surface_em
 from sftex_stages.geometry.refine import climb
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+Float = NDArray[np.floating]
+Int = NDArray[np.integer]
 
 LADDER = ((3.0, 8.0), (1.0, 4.0), (1.0, 2.0), (1.0, 0.7))  # strength, reach in spacings of nodes
 EM_SPACING = 1.5  # of the radial functions, in spacings of nodes
@@ -53,6 +53,7 @@ class Candidate:
     a: Float  # coefficients of the surface on the search's grid
     light: shading.Light | None
     origin: str
+    tuned: bool  # whether smoothness and noise were searched for it, or are those it was found at
 
     @property
     def evidence(self) -> float:
@@ -183,7 +184,7 @@ def judge(
             factor = float(np.exp(best[2]))
         inside = data.trust * _inside(data, y - mean, alone, factor)
     shade, light = shade_of(data, s)
-    return Candidate(s, score(best), shade, smooth, factor, inside, a, light, origin)
+    return Candidate(s, score(best), shade, smooth, factor, inside, a, light, origin, rounds > 0)
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -204,7 +205,10 @@ def distinct(patterns: Float, trust: Float, limit: float = 0.99) -> list[int]:
 
 
 def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, survivors: int = 10) -> list[Candidate]:
-    """The best sign patterns, best first; `f` has the points of `data` on a grid about as fine as their `spacing` px."""
+    """Sign patterns, best first: `finalists` whose settings were tuned, then those that fell behind.
+
+    `f` has the points of `data`, on a grid about as fine as their mean `spacing` (px).
+    """
     weight = np.linalg.inv(data.covariance) * data.trust[:, None, None]
     patterns, names = starts(data)
     pairs = neighbours(data.xy)
@@ -233,7 +237,7 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
     first = [judge(data, f, s, smooth, 1.0, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
     last = [judge(data, f, x.s, x.smooth, x.noise, 2, x.origin) for x in first[:finalists]]
-    return sorted(last, key=lambda x: -x.evidence)
+    return sorted(last, key=lambda x: -x.evidence) + first[finalists:]
 
 
 def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list[Candidate]:
@@ -242,9 +246,7 @@ def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list
     found = []
     for k in range(4):
         start = surface_em.cylinder(data.xy, k * np.pi / 4)
-        result = surface_em.run(
-            data.xy, data.d, data.covariance, data.log_outlier, start, EM_SPACING * spacing
-        )
+        result = surface_em.run(data.xy, data.d, data.covariance, data.log_outlier, start, EM_SPACING * spacing)
         s = np.where(result.state[:, 0] < result.state[:, 1], -1.0, 1.0)
         found.append(judge(data, f, s, smooth, 1.0, 1, f"em, cylinder {45 * k}°"))
     return sorted(found, key=lambda x: -x.evidence)[:finalists]

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from sftex_stages.geometry import blocks, gaussian
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 DAMPING = 0.6  # share of the new mean in a parallel mean-field step; 1 oscillates
 
@@ -106,7 +106,7 @@ def descend(c: Coupling, start: Float, bias: Float, sweeps: int = 200) -> Float:
     return s
 
 
-def flip_regions(c: Coupling, s: Float, bias: Float, region: NDArray[np.int64]) -> Float:
+def flip_regions(c: Coupling, s: Float, bias: Float, region: NDArray[np.integer]) -> Float:
     """Cluster moves: the best signs (N,) that differ from `s` (N,) by whole regions (N,) numbered 0 … R − 1.
 
     The energy of region signs t is an R-spin problem of the same form; greedy descent of it from `s` and from each

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 BLOCK = 3  # rows of the grid in a block: a cubic spline couples four consecutive rows, hence adjacent blocks only
 
@@ -60,29 +60,28 @@ def cover(low: Float, high: Float, spacing: float) -> Grid:
 
 def _weights(u: Float, derivative: int) -> Float:
     """Weights (4, …) of the four cubic B-splines over a unit cell at `u` in 0…1, or their derivatives in u."""
-    if derivative == 0:
-        w = ((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3)
-    elif derivative == 1:
-        w = (-3 * (1 - u) ** 2, 9 * u**2 - 12 * u, -9 * u**2 + 6 * u + 3, 3 * u**2)
-    elif derivative == 2:
-        w = (6 * (1 - u), 18 * u - 12, -18 * u + 6, 6 * u)
-    else:
-        one = np.ones_like(u)
-        w = (-6 * one, 18 * one, -18 * one, 6 * one)
-    return np.stack(w) / 6
+    one = np.ones_like(u)
+    polynomials = (
+        ((1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4 * one, -3 * u**3 + 3 * u**2 + 3 * u + one, u**3),
+        (-3 * (1 - u) ** 2, 9 * u**2 - 12 * u, -9 * u**2 + 6 * u + 3 * one, 3 * u**2),
+        (6 * (1 - u), 18 * u - 12 * one, -18 * u + 6 * one, 6 * u),
+        (-6 * one, 18 * one, -18 * one, 6 * one),
+    )
+    return np.asarray(np.stack(polynomials[derivative]) / 6)
 
 
-def _axis(grid: Grid, axis: int, x: Float, derivative: int) -> tuple[NDArray[np.int64], Float]:
+def _axis(grid: Grid, axis: int, x: Float, derivative: int) -> tuple[NDArray[np.integer], Float]:
     """First coefficient (N,) and the four weights (4, N) of coordinates `x` (N,) px; the end cells extrapolate."""
     t = (np.asarray(x, float) - grid.origin[axis]) / grid.spacing
     cell = np.clip(np.floor(t).astype(np.int64), 0, grid.cells[axis] - 1)
     return cell, _weights(t - cell, derivative) / grid.spacing**derivative
 
 
-def stencil(grid: Grid, xy: Float, dx: int = 0, dy: int = 0) -> tuple[NDArray[np.int64], Float]:
+def stencil(grid: Grid, xy: Float, dx: int = 0, dy: int = 0) -> tuple[NDArray[np.integer], Float]:
     """Coefficient numbers (N, 16) and weights (N, 16) of the (dx, dy) derivative of the field at `xy` (N, 2) px."""
     xy = np.asarray(xy, float)
-    first, weight = zip(_axis(grid, 0, xy[:, 0], dx), _axis(grid, 1, xy[:, 1], dy), strict=True)
+    (first_x, x), (first_y, y) = _axis(grid, 0, xy[:, 0], dx), _axis(grid, 1, xy[:, 1], dy)
+    first, weight = (first_x, first_y), (x, y)
     o, i = grid.outer, 1 - grid.outer
     k = np.arange(4)
     rows = first[o][:, None] + k
@@ -104,7 +103,9 @@ def gradient_design(grid: Grid, xy: Float) -> sp.csr_matrix:
     (index, p), (_, q) = stencil(grid, xy, 1, 0), stencil(grid, xy, 0, 1)
     value = np.stack((p, q), 1)
     index = np.repeat(index[:, None, :], 2, 1)
-    return sp.csr_matrix((value.ravel(), index.ravel(), np.arange(0, index.size + 1, 16)), shape=(2 * len(p), grid.size))
+    return sp.csr_matrix(
+        (value.ravel(), index.ravel(), np.arange(0, index.size + 1, 16)), shape=(2 * len(p), grid.size)
+    )
 
 
 def energy(grid: Grid, order: int) -> sp.csr_matrix:

@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
 from sftex_stages.geometry import blocks, gaussian, spline, tensors
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 GAPS = 2.2  # reach of a measurement, in the typical (upper quartile) distance of a point from its nearest measurement
 EXCESS = 2.0  # of the variance: neighbouring instances share errors that the posterior counts as independent
@@ -48,8 +48,8 @@ def dense(
 ) -> dict[str, NDArray]:
     """Maps of an image of `shape` (H, W): `height` px, `normals` (H, W, 3), `sigma` degrees, `supported`.
 
-    `xy` (N, 2) are the measurements believed, `common` the error of w they share (`calibration.py`). Height and gradient are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster
-    and interpolated.
+    `xy` (N, 2) are the measurements believed, `common` the error of w they share (`calibration.py`). Height and gradient
+    are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster and interpolated.
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
     g = np.stack([spline.evaluate(f.grid, a, columns, rows, *d) for d in ((1, 0), (0, 1))], -1)
@@ -78,10 +78,8 @@ def covariance_at(grid: spline.Grid, factor: blocks.Factor, xy: Float) -> Float:
     index, p = spline.stencil(grid, xy, 1, 0)
     stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
     inverse = blocks.selected_inverse(factor)
-    parts = range(0, len(xy), 4096)  # 256 numbers a point: bounded memory
-    return np.concatenate(
-        [blocks.covariance(inverse, index[k : k + 4096], stencil[k : k + 4096], stencil[k : k + 4096]) for k in parts]
-    )
+    parts = [slice(k, k + 4096) for k in range(0, len(xy), 4096)]  # 256 numbers a point: bounded memory
+    return np.concatenate([blocks.covariance(inverse, index[k], stencil[k], stencil[k]) for k in parts])
 
 
 def _enlarge(coarse: Float, shape: tuple[int, int]) -> Float:

@@ -11,7 +11,7 @@ blind to the sign of (p, q). Noise is additive in w, not in (p, q): near the fro
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+Float = NDArray[np.floating]
 
 STEEPEST = 0.97  # sin² of the steepest slant that a single instance is believed to show (80 degrees)
 

@@ -1,0 +1,140 @@
+from itertools import product
+
+import numpy as np
+import pytest
+
+from sftex_stages.geometry import gaussian, shading, sign_search, signs, spline, surface_em, tensors
+
+
+def problem(n, seed, noise=0.05, extent=100.0, bend=60.0):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, extent, (n, 2))
+    g = np.stack((0.9 * np.sin(xy[:, 0] / bend), 0.9 * np.cos(xy[:, 1] / bend)), 1)
+    truth = rng.choice([-1.0, 1.0], n)
+    d = truth[:, None] * (g + noise * rng.normal(size=g.shape))
+    return xy, d, np.tile(noise**2 * np.eye(2), (n, 1, 1)), truth, g
+
+
+def data_of(xy, d, covariance, cue=None):
+    return sign_search.Data(xy, d, covariance, np.ones(len(d)), np.full(len(d), -3.0), cue)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_search_finds_the_best_of_all_patterns(seed):
+    xy, d, covariance, _, _ = problem(12, seed, noise=0.15)
+    bias = 0.3 * np.random.default_rng(seed).normal(size=12)
+    f = gaussian.make_field(spline.cover(np.full(2, -20.0), np.full(2, 120.0), 20.0), xy)
+    c = signs.coupling(f, d, np.linalg.inv(covariance), gaussian.Smoothness(0.5, 40.0))
+    everything = np.array(list(product([-1.0, 1.0], repeat=12))).T
+    best = signs.energies(c, everything, np.tile(bias[:, None], (1, everything.shape[1]))).min()
+    starts = np.concatenate((sign_search.starts(data_of(xy, d, covariance))[0], signs.spectral_starts(c, 3)), 1)
+    starts = np.concatenate((starts, -starts), 1)
+    fields = np.tile(bias[:, None], (1, starts.shape[1]))
+    found = signs.descend(c, signs.anneal(c, 0.7 * starts, fields, np.geomspace(0.02, 1, 24)), fields)
+    assert signs.energies(c, found, fields).min() == pytest.approx(best, abs=1e-6)
+
+
+def test_energy_is_the_marginal_likelihood_up_to_a_constant():
+    xy, d, covariance, _, _ = problem(15, 3)
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 20.0), xy)
+    weight, smooth = np.linalg.inv(covariance), gaussian.Smoothness(1.0, 30.0)
+    c = signs.coupling(f, d, weight, smooth)
+    s = np.random.default_rng(0).choice([-1.0, 1.0], (15, 4))
+    energy = signs.energies(c, s, np.zeros_like(s))
+    evidence = [gaussian.log_evidence(f, weight, c.pull * s[:, k, None], smooth) for k in range(4)]
+    assert np.allclose(energy + evidence, 0.5 * c.log_det, atol=1e-6)
+    unit = np.eye(15)
+    assert np.allclose(np.diag(signs.product(c, unit)), c.own)
+
+
+def test_descent_and_region_moves_never_raise_the_energy():
+    xy, d, covariance, _, _ = problem(200, 1)
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 10.0), xy)
+    c = signs.coupling(f, d, np.linalg.inv(covariance), gaussian.Smoothness(1.0, 20.0))
+    s = np.random.default_rng(0).choice([-1.0, 1.0], (200, 5))
+    zero = np.zeros_like(s)
+    after = signs.descend(c, s, zero)
+    assert (signs.energies(c, after, zero) < signs.energies(c, s, zero)).all()
+    region = (xy[:, 0] > 50).astype(np.int64)
+    moved = signs.flip_regions(c, after[:, 0], zero[:, 0], region)
+    assert signs.energies(c, moved[:, None], zero[:, :1])[0] <= signs.energies(c, after[:, :1], zero[:, :1])[0] + 1e-6
+
+
+def test_region_move_mends_a_flipped_half():
+    xy, d, covariance, truth, _ = problem(200, 2)
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 10.0), xy)
+    c = signs.coupling(f, d, np.linalg.inv(covariance), gaussian.Smoothness(1.0, 40.0))
+    region = (xy[:, 1] > 50).astype(np.int64)
+    mended = signs.flip_regions(c, truth * np.where(region == 1, -1, 1), np.zeros(200), region)
+    assert abs((mended * truth).mean()) == 1
+
+
+def test_search_recovers_signs_from_all_cues_and_ranks_by_evidence():
+    xy, d, covariance, truth, g = problem(250, 4, noise=0.04, extent=300.0)
+    n = tensors.normals(g)
+    rng = np.random.default_rng(1)
+    light = 0.5 + 0.4 * n[:, 2] + 0.3 * n[:, 0] - 0.2 * n[:, 1] + 0.01 * rng.normal(size=250)
+    cue = shading.make_shading(xy, light / light.mean(), np.full(250, 1e-4), tensors.normals(d))
+    f = gaussian.make_field(spline.cover(np.full(2, -20.0), np.full(2, 320.0), 20.0), xy)
+    found = sign_search.search(data_of(xy, d, covariance, cue), f, 19.0, 3)
+    sloped = np.linalg.norm(g, axis=1) > 0.15
+    assert abs((found[0].s * truth)[sloped].mean()) > 0.99
+    tuned = [c.evidence for c in found if c.tuned]
+    assert tuned == sorted(tuned, reverse=True) and len(tuned) <= 3
+    direction = found[0].light.direction[2:] * np.sign((found[0].s * truth).sum())
+    assert np.allclose(direction / np.linalg.norm(direction), np.array([3, -2]) / np.sqrt(13), atol=0.1)
+
+
+def test_light_is_recovered_and_pulls_toward_the_true_signs():
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(0, 100, (400, 2))
+    g = rng.normal(size=(400, 2)) * 0.5
+    n = tensors.normals(g)
+    e = 0.4 + 0.6 * n[:, 2] + 0.5 * n[:, 0] + 0.01 * rng.normal(size=400)
+    e[::20] *= 0.3  # cast shadows
+    data = shading.make_shading(xy, e, np.full(400, 1e-4), n)
+    light = shading.fit(data, np.ones(400), rounds=10)
+    assert np.allclose(light.direction[2:], [0.5, 0.0], atol=0.03)
+    far = (np.abs(n[:, 0]) > 0.1) & (np.arange(400) % 20 > 0)
+    assert (shading.pull(data, light)[far] > 0).mean() > 0.97
+    null = shading.fit(data, np.zeros(400), directed=False, rounds=10)
+    assert light.log_likelihood > null.log_likelihood + 100
+
+
+def test_constant_irradiance_says_nothing():
+    rng = np.random.default_rng(6)
+    xy = rng.uniform(0, 100, (300, 2))
+    n = tensors.normals(rng.normal(size=(300, 2)) * 0.5)
+    data = shading.make_shading(xy, 1 + 0.01 * rng.normal(size=300), np.full(300, 1e-4), n)
+    value, _ = sign_search.shade_of(
+        sign_search.Data(xy, n[:, :2], np.ones((300, 2, 2)), np.ones(300), xy[:, 0], data), np.ones(300)
+    )
+    assert value < 3
+
+
+def test_em_raises_its_posterior_and_solves_a_cylinder():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 100, (120, 2))
+    g = surface_em.cylinder(xy, 0.3)
+    truth = rng.choice([-1.0, 1.0], 120)
+    d = truth[:, None] * g + 0.05 * rng.normal(size=g.shape)
+    d[:6] = rng.normal(size=(6, 2)) * 3
+    covariance = np.tile(0.01 * np.eye(2), (120, 1, 1))
+    result = surface_em.run(xy, d, covariance, np.full(120, -4.0), surface_em.cylinder(xy, 0.0), 25.0)
+    assert (np.diff(result.history) > -1e-9 * np.abs(result.history[:-1])).all()
+    assert result.history[-1] > result.history[0] + 10
+    sign = np.where(result.state[:, 0] > result.state[:, 1], 1, -1)
+    steep = np.linalg.norm(g, axis=1) > 0.3
+    steep[:6] = False
+    assert (sign == truth)[steep].mean() > 0.95
+    assert np.allclose(result.state.sum(1), 1)
+
+
+def test_radial_gradient_against_finite_differences():
+    rng = np.random.default_rng(1)
+    xy, centres = rng.uniform(0, 100, (10, 2)), rng.uniform(0, 100, (7, 2))
+    gradient = surface_em.radial_gradient(xy, centres, 20.0)
+    for k in range(2):
+        e = 1e-5 * np.eye(2)[k]
+        numeric = (surface_em.radial(xy + e, centres, 20.0) - surface_em.radial(xy - e, centres, 20.0)) / 2e-5
+        assert np.abs(numeric - gradient[:, k]).max() < 1e-9

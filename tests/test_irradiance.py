@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from sftex_stages import irradiance
+from sftex_stages.errors import StageError
+
+SHAPE = (240, 320)
+
+
+def surface_of(n=600, noise=0.0, seed=0):
+    """What the surface stage hands on, under a known light; texton 2 of four has no instance."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, [SHAPE[1] - 1, SHAPE[0] - 1], (n, 2))
+    texton = rng.choice([0, 1, 3], n).astype(np.int32)
+    scale = np.array([1.0, 2.5, np.nan, 0.4])
+    light = field(xy[:, 0], xy[:, 1]) / scale[texton] * np.exp(noise * rng.normal(size=n))
+    valid = np.zeros(SHAPE, bool)
+    valid[10:-10, 10:-10] = True
+    arrays = {
+        "valid": valid,
+        "instance/xy": xy.astype(np.float32),
+        "instance/irradiance": light.astype(np.float32),
+        "instance/irradiance_sigma": np.full(n, 0.003, np.float32),
+        "instance/texton": texton,
+        "instance/inlier": np.full(n, 0.95, np.float32),
+        "instance/state": np.tile(np.array([1, 0, 0], np.float32), (n, 1)),
+    }
+    return arrays, scale
+
+
+def field(x, y):
+    return np.exp(0.4 * np.sin(x / 60) - 0.5 * np.cos(y / 80))
+
+
+def log_error(out):
+    y, x = np.nonzero(np.isfinite(out["map"]))
+    ratio = np.log(out["map"][y, x] / field(x, y))
+    return np.abs(ratio - np.median(ratio))
+
+
+def test_exact_data_give_map_and_scales():
+    surface, scale = surface_of()
+    out = irradiance.run({"surface": surface}, irradiance.Params())
+    assert np.quantile(log_error(out), 0.99) < 0.01
+    found = out["class_scale"] / out["class_scale"][0]
+    assert np.isnan(found[2]) and np.allclose(found[[0, 1, 3]], scale[[0, 1, 3]], rtol=0.005)
+    assert np.array_equal(np.isfinite(out["map"]), surface["valid"])
+    assert abs(np.log(out["map"][surface["valid"]]).mean()) < 1e-5
+
+
+def test_instances_are_put_on_the_maps_scale():
+    surface, _ = surface_of()
+    out = irradiance.run({"surface": surface}, irradiance.Params())
+    at = np.rint(surface["instance/xy"]).astype(int)
+    inside = surface["valid"][at[:, 1], at[:, 0]]
+    ratio = out["instance/irradiance"][inside] / out["map"][at[inside, 1], at[inside, 0]]
+    assert np.abs(np.log(ratio)).max() < 0.05
+
+
+def test_noise_is_smoothed_and_outliers_of_either_kind_ignored():
+    surface, _ = surface_of(noise=0.02, seed=1)
+    surface["instance/irradiance"][::20] *= 3
+    surface["instance/irradiance"][5::40] = 0  # no positive estimate: left out
+    surface["instance/state"][::20] = [0, 0, 1]
+    out = irradiance.run({"surface": surface}, irradiance.Params())
+    assert np.median(log_error(out)) < 0.01
+
+
+def test_too_few_instances():
+    surface, _ = surface_of(10)
+    surface["instance/inlier"][2:] = 0.1
+    with pytest.raises(StageError, match="only 2 instances"):
+        irradiance.run({"surface": surface}, irradiance.Params())

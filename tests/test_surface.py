@@ -1,0 +1,144 @@
+import numpy as np
+import pytest
+from synthetic_instances import instances_of, jittered
+
+from sftex_stages import surface
+from sftex_stages.errors import StageError
+from sftex_stages.geometry import tensors
+
+SHAPE = (300, 360)
+
+
+def image(mask=None):
+    return {"rgb": np.zeros((*SHAPE, 3), np.float32), "mask": np.ones(SHAPE, bool) if mask is None else mask}
+
+
+def bumps(xy):
+    """Height gradient of a doubly curved surface."""
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack((0.8 * np.cos(x / 70) - 0.002 * (x - 180), -0.7 * np.sin(y / 60) - 0.002 * (y - 150)), -1)
+
+
+def angles(out, gradient):
+    x, y = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
+    truth = tensors.normals(gradient(np.stack((x, y), -1).astype(float)))
+    valid = out["valid"]
+    found = out["normals"][valid].astype(float)
+    both = [np.degrees(np.arccos(np.clip((found * truth[valid] * m).sum(-1), -1, 1))) for m in ([1, 1, 1], [-1, -1, 1])]
+    return min(both, key=np.median)
+
+
+@pytest.fixture(scope="module")
+def found():
+    xy = jittered(SHAPE, 16)
+    frontal = instances_of((xy, bumps(xy)), noise=0.006)
+    return surface.run({"image": image(), "frontal": frontal}, surface.Params())
+
+
+def test_smooth_surface_from_signless_instances(found):
+    error = angles(found, bumps)
+    assert np.median(error) < 1.5
+    assert (error < 5).mean() > 0.95
+    assert found["valid"].mean() > 0.95
+
+
+def test_outputs_are_as_documented(found):
+    n = len(found["instance/xy"])
+    assert found["height"].shape == SHAPE and found["height"].dtype == np.float32
+    assert found["normals"].shape == (*SHAPE, 3)
+    for name in ("height", "normal_sigma"):
+        assert np.array_equal(np.isfinite(found[name]), found["valid"])
+    valid = found["valid"]
+    assert np.allclose(np.linalg.norm(found["normals"][valid], axis=1), 1, atol=1e-5)
+    assert np.allclose(found["instance/state"].sum(1), 1, atol=1e-5) and found["instance/state"].shape == (n, 3)
+    p, q = np.gradient(found["height"].astype(float))[::-1]
+    normal = tensors.normals(np.stack((p, q), -1))[valid & np.isfinite(p) & np.isfinite(q)]
+    stored = found["normals"][valid & np.isfinite(p) & np.isfinite(q)]
+    assert (normal * stored).sum(-1).min() > 0.999
+    evidence = found["candidate/shape"] + found["candidate/shading"]
+    assert evidence[0] == evidence[found["candidate/tuned"]].max()
+
+
+def test_sigma_is_of_the_size_of_the_error(found):
+    error = angles(found, bumps)
+    sigma = found["normal_sigma"][found["valid"]]
+    ratio = np.sqrt((error**2).mean()) / np.sqrt((sigma**2).mean())
+    assert 0.3 < ratio < 2
+
+
+def test_instances_have_the_sign_of_the_surface(found):
+    xy = np.rint(found["instance/xy"]).astype(int)
+    inside = found["valid"][xy[:, 1], xy[:, 0]]
+    normal = found["normals"][xy[inside, 1], xy[inside, 0]]
+    assert ((normal[:, :2] * found["instance/normal"][inside, :2]).sum(1) > -0.02).all()
+
+
+def test_same_input_gives_the_same_bytes(found):
+    xy = jittered(SHAPE, 16)
+    again = surface.run({"image": image(), "frontal": instances_of((xy, bumps(xy)), noise=0.006)}, surface.Params())
+    assert all(np.array_equal(found[k], again[k], equal_nan=found[k].dtype.kind == "f") for k in found)
+
+
+def test_mask_and_hole_are_respected():
+    xy = jittered(SHAPE, 16)
+    xy = xy[np.hypot(xy[:, 0] - 180, xy[:, 1] - 150) > 70]
+    mask = np.ones(SHAPE, bool)
+    mask[:, :60] = False
+    xy = xy[mask[xy[:, 1].astype(int), xy[:, 0].astype(int)]]
+    out = surface.run({"image": image(mask), "frontal": instances_of((xy, bumps(xy)))}, surface.Params())
+    assert not out["valid"][:, :60].any()
+    assert not out["valid"][150, 180]
+    assert out["valid"][20:280, 70:100].mean() > 0.9
+
+
+def test_tilted_plane_comes_out_flat():
+    xy = jittered(SHAPE, 18)
+    out = surface.run(
+        {"image": image(), "frontal": instances_of((xy, np.tile([0.7, -0.4], (len(xy), 1))), noise=0.005)},
+        surface.Params(),
+    )
+    error = angles(out, lambda at: np.broadcast_to([0.7, -0.4], at.shape))
+    assert np.quantile(error, 0.99) < 2
+
+
+def test_shading_from_above_decides_between_a_surface_and_its_mirror_image():
+    xy = jittered(SHAPE, 16)
+    g = bumps(xy)
+    n = tensors.normals(g)
+    light = 0.5 + 0.4 * n[:, 2] - 0.35 * n[:, 1] + 0.15 * n[:, 0]
+    out = surface.run({"image": image(), "frontal": instances_of((xy, g), noise=0.005, light=light)}, surface.Params())
+    x, y = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
+    truth = tensors.normals(bumps(np.stack((x, y), -1).astype(float)))[out["valid"]]
+    assert np.median(np.degrees(np.arccos(np.clip((out["normals"][out["valid"]] * truth).sum(1), -1, 1)))) < 1.5
+
+
+def test_the_papers_em_is_a_method_too():
+    xy = jittered(SHAPE, 16)
+    curve = lambda at: np.stack(((180 - at[..., 0]) / 200, np.zeros(at.shape[:-1])), -1)  # noqa: E731
+    out = surface.run(
+        {"image": image(), "frontal": instances_of((xy, curve(xy)), noise=0.005)}, surface.Params(method="em")
+    )
+    assert np.median(angles(out, curve)) < 2
+    assert all(str(name).startswith("em") for name in out["candidate/origin"])
+
+
+def test_without_a_usable_texton_the_message_says_what_to_do():
+    part = instances_of((jittered(SHAPE, 40), bumps(jittered(SHAPE, 40))), textons=1)[0]
+    part["usable"] = np.array(False)
+    with pytest.raises(StageError, match="none of the 1 texture elements is usable"):
+        surface.run({"image": image(), "frontal": [part]}, surface.Params())
+
+
+def test_too_few_instances_to_believe_in():
+    part = instances_of((jittered(SHAPE, 40), bumps(jittered(SHAPE, 40))), textons=1)[0]
+    part["inlier"] = np.full(len(part["xy"]), 0.5, np.float32)
+    part["inlier"][:2] = 0.99
+    with pytest.raises(StageError, match=r"only 2 of \d+ instances .*min_inlier"):
+        surface.run({"image": image(), "frontal": [part]}, surface.Params())
+
+
+@pytest.mark.parametrize("count", [3, 5, 12])
+def test_very_few_instances_still_give_a_surface(count):
+    xy = jittered(SHAPE, 60)[:count]
+    out = surface.run({"image": image(), "frontal": instances_of((xy, bumps(xy)), textons=1)}, surface.Params())
+    assert np.isfinite(out["energy"]) and out["valid"].shape == SHAPE
