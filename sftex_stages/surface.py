@@ -87,7 +87,14 @@ def prepare(rows: Arrays, params: Params) -> Instances:
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """Height, normals, their support and uncertainty, and instances with their sign resolved.
 
-    See the README's archive section for shapes and units of the arrays returned.
+    Returns
+    -------
+    height (H, W) px toward the camera, mean 0; normals (H, W, 3) ∝ (−p, −q, 1); valid (H, W) bool; normal_sigma (H, W)
+    degrees, the root mean square angle expected; all NaN where not valid.
+    instance/… (N, …), members of usable textons: xy, transform, inlier, irradiance, irradiance_sigma as delivered; normal
+    calibrated, its sign resolved; normal_sigma of the surface there; texton; state, posteriors of {as delivered, the other
+    sign, not from the surface}; sign_margin, nats by which the energy rises if the patch around flips (NaN: not used).
+    energy, −log evidence of the surface; candidate/… and light: see `record`.
 
     Raises
     ------
@@ -113,9 +120,12 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy)
     start = gaussian.gradients(coarse, best.a)
     solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth)
-    if mirrored(nodes.xy, solution, best):
+    mirror = mirrored(nodes.xy, solution, best)
+    if mirror:
         solution = refine.flipped(solution)
-    return outputs(mask, instances, nodes, solution, fine, candidates, spacing)
+    results = outputs(mask, instances, solution, fine, spacing)
+    margin = np.append(sign_search.margins(data, coarse, best), np.nan)[nodes.member]
+    return results | {"instance/sign_margin": margin.astype(np.float32)} | record(candidates, mirror)
 
 
 def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, params: Params) -> sign_search.Data:
@@ -151,10 +161,8 @@ def mirrored(xy: Float, solution: refine.Solution, best: sign_search.Candidate) 
 def outputs(
     mask: NDArray[np.bool_],
     instances: Instances,
-    nodes: pooling.Nodes,
     solution: refine.Solution,
     field: gaussian.Field,
-    candidates: list[sign_search.Candidate],
     spacing: float,
 ) -> Arrays:
     """Dense maps and instances."""
@@ -187,10 +195,22 @@ def outputs(
         "instance/state": state.astype(np.float32),
         "camera": np.array("orthographic"),
         "energy": np.array(-solution.evidence),
+    }
+
+
+def record(candidates: list[sign_search.Candidate], mirror: bool) -> Arrays:
+    """What was tried: evidences (C,) in nats of the candidate sign patterns, best first, and the light of the best one.
+
+    candidate/shape and candidate/shading add up to the evidence that ranks the tuned ones (candidate/tuned); candidate/origin
+    names the start. light (4,) = (a, b, c_x, c_y): irradiance a + b n_z + c·n_xy relative to its mean, NaN without shading.
+    """
+    light = np.full(4, np.nan) if candidates[0].light is None else candidates[0].light.direction
+    return {
         "candidate/shape": np.array([c.shape for c in candidates]),
         "candidate/shading": np.array([c.shade for c in candidates]),
         "candidate/origin": np.array([c.origin for c in candidates]),
         "candidate/tuned": np.array([c.tuned for c in candidates]),
+        "light": light * np.array([1, 1, -1, -1]) if mirror else light,
     }
 
 

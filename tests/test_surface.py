@@ -109,6 +109,10 @@ def test_shading_from_above_decides_between_a_surface_and_its_mirror_image():
     out = surface.run({"image": image(), "frontal": instances_of((xy, g), noise=0.005, light=light)}, surface.Params())
     x, y = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
     truth = tensors.normals(bumps(np.stack((x, y), -1).astype(float)))[out["valid"]]
+    found = out["light"][2:] / np.linalg.norm(out["light"][2:])
+    assert np.allclose(found, np.array([0.15, -0.35]) / np.hypot(0.15, 0.35), atol=0.1)
+    margin = out["instance/sign_margin"]
+    assert np.isfinite(margin).all() and np.median(margin) > 10
     assert np.median(np.degrees(np.arccos(np.clip((out["normals"][out["valid"]] * truth).sum(1), -1, 1)))) < 1.5
 
 

@@ -8,6 +8,7 @@ all this is linear; given the light, the data are a linear field on the signs.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +25,17 @@ QUIET = 0.03  # least noise believed, of the mean irradiance: model error of "on
 
 @dataclass(frozen=True)
 class Shading:
-    """Irradiance `e` (M,) of mean 1, its variance (M,), measured normals (M, 3) with any sign, and the basis (M, U) of u."""
+    """Irradiance `e` (M,) of mean 1, its variance (M,), measured normals (M, 3) with any sign, the basis (M, U) of u."""
 
     e: Float
     variance: Float
     normal: Float
     basis: Float
+
+    @cached_property
+    def null(self) -> "Light":
+        """The best light that tells nothing of signs."""
+        return fit(self, np.zeros(len(self.e)), rounds=6, directed=False)
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,6 @@ def pull(data: Shading, light: Light) -> Float:
 
 def aligned(data: Shading, azimuth: float) -> Float:
     """Signs (M,) of a surface lit from that azimuth, where brighter than the slant explains means facing the light."""
-    null = fit(data, np.zeros(len(data.e)), directed=False)
-    n = data.normal
+    null, n = data.null, data.normal
     rest = data.e - null.direction[0] - null.direction[1] * n[:, 2] - data.basis @ null.remainder
     return np.where(rest * (n[:, 0] * np.cos(azimuth) + n[:, 1] * np.sin(azimuth)) < 0, -1.0, 1.0)

@@ -136,9 +136,8 @@ def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
     """Log likelihood that the shading gives signs `s` (N,), relative to a light that tells nothing."""
     if data.shading is None:
         return 0.0, None
-    null = shading.fit(data.shading, np.zeros(len(s)), directed=False, rounds=6).log_likelihood
-    light = shading.fit(data.shading, s, rounds=6)
-    return SAY_OF_SHADING * max(light.log_likelihood - null - 2.0, 0.0), light
+    light = shading.fit(data.shading, s, rounds=4)
+    return SAY_OF_SHADING * max(light.log_likelihood - data.shading.null.log_likelihood - 2.0, 0.0), light
 
 
 def judge(
@@ -250,6 +249,23 @@ def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list
         s = np.where(result.state[:, 0] < result.state[:, 1], -1.0, 1.0)
         found.append(judge(data, f, s, smooth, 1.0, 1, f"em, cylinder {45 * k}°"))
     return sorted(found, key=lambda x: -x.evidence)[:finalists]
+
+
+def margins(data: Data, f: gaussian.Field, best: Candidate) -> Float:
+    """How sure the signs are, patch by patch: nats (N,) by which the energy would rise if a node's whole patch flipped.
+
+    A patch is a connected region of one slope direction (`patches`); the global mirror image is another matter.
+    """
+    weight = np.linalg.inv(data.covariance) * (best.inside / best.noise)[:, None, None]
+    c = signs.coupling(f, data.d, weight, best.smooth)
+    label = patches(data, neighbours(data.xy), 0.15)
+    member = np.zeros((len(best.s), int(label.max()) + 1))
+    member[np.arange(len(best.s)), label] = best.s
+    k = member.T @ signs.product(c, member)
+    gain = 2 * (k.sum(1) - np.diag(k))
+    if data.shading is not None and best.light is not None:
+        gain += 2 * member.T @ (SAY_OF_SHADING * data.trust * shading.pull(data.shading, best.light))
+    return gain[label]
 
 
 def shortlist(
