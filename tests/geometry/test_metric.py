@@ -69,12 +69,43 @@ def test_lemma4_three_instances_are_enough(seed):
     assert error_of(upgrade_of(t @ np.linalg.inv(a)).gram, a) < 1e-6
 
 
-def test_lemma4_no_other_map_leaves_three_instances_imaging_transforms(rng):
-    t = transforms(rng, 3, 30, 60)
+def test_lemma4_no_other_map_leaves_four_instances_imaging_transforms(rng):
+    t = transforms(rng, 4, 30, 60)
     worst = [np.abs(lemma1_residual(t @ affine_map(rng))).max() for _ in range(500)]
     assert min(worst) > 1e-3
     turned = t @ rotation(0.7) @ np.diag([1.0, -1.0])
     assert np.abs(lemma1_residual(turned)).max() < 1e-12
+
+
+def second_frame(t):
+    """The other M that meets det² d − tr(T M Tᵀ) + 1 = 0, d = det M, for three transforms; None if it is no frame.
+
+    Three equations leave a line of (M, d) through (I, 1); det M = d meets it in one more point.
+    """
+    gtg, det2 = np.swapaxes(t, 1, 2) @ t, np.linalg.det(t) ** 2
+    k = np.linalg.svd(np.stack([gtg[:, 0, 0], 2 * gtg[:, 0, 1], gtg[:, 1, 1], -det2], -1))[2][-1]
+    x = -(k[0] + k[2] - k[3]) / (k[0] * k[2] - k[1] ** 2)
+    gram = np.array([[1 + x * k[0], x * k[1]], [x * k[1], 1 + x * k[2]]])
+    if np.linalg.eigvalsh(gram)[0] < 0.05 or abs(x) < 0.1:
+        return None
+    larger = np.linalg.svd(t @ np.linalg.cholesky(gram), compute_uv=False)[:, 0]
+    return gram if np.abs(larger - 1).max() < 1e-9 else None
+
+
+def test_lemma4_three_instances_may_allow_a_second_frame_and_a_fourth_rules_it_out(rng):
+    """The lemma's three preserved directions are the same for both frames only if their images are, which need not be."""
+    seen = 0
+    for _ in range(60):
+        t = transforms(rng, 4, 15, 70)
+        other = second_frame(t[:3])
+        if other is None:
+            continue
+        seen += 1
+        root = np.linalg.cholesky(other)
+        assert np.abs(lemma1_residual(t[:3] @ root)).max() < 1e-9  # exact, and yet not the frontal frame
+        assert np.abs(root.T @ root - np.eye(2)).max() > 1e-3
+        assert np.abs(np.linalg.svd(t[3] @ root, compute_uv=False)[0] - 1) > 1e-5
+    assert seen > 10
 
 
 def test_units_of_the_frames_do_not_matter(rng):
