@@ -17,6 +17,7 @@ Float = NDArray[np.floating]
 Int = NDArray[np.integer]
 
 _pbtrf, _pbtrs, _trtri = get_lapack_funcs(("pbtrf", "pbtrs", "trtri"), dtype=np.float64)
+CHUNK = 4096  # stencils whose k² entries of the inverse are gathered at a time: bounded memory
 FEW = 2  # right-hand sides up to which the band is solved directly
 
 
@@ -114,10 +115,13 @@ def covariance(inverse: tuple[Float, Float], index: Int, left: Float, right: Flo
     """
     diagonal, below = inverse
     b = diagonal.shape[1]
-    block, inner = np.divmod(index, b)
-    bi, bj = block[:, :, None], block[:, None, :]
     flat = np.concatenate((diagonal.ravel(), below.ravel()))
-    i, j = inner[:, :, None], inner[:, None, :]
-    number = np.where(bi == bj, bi, len(diagonal) + np.minimum(bi, bj))
-    values = flat[np.where(bi >= bj, (number * b + i) * b + j, (number * b + j) * b + i)]
-    return np.asarray((left @ values) @ np.swapaxes(right, 1, 2))
+    out = np.empty((len(index), left.shape[1], right.shape[1]))
+    for at in (slice(k, k + CHUNK) for k in range(0, len(index), CHUNK)):
+        block, inner = np.divmod(index[at], b)
+        bi, bj = block[:, :, None], block[:, None, :]
+        i, j = inner[:, :, None], inner[:, None, :]
+        number = np.where(bi == bj, bi, len(diagonal) + np.minimum(bi, bj))
+        values = flat[np.where(bi >= bj, (number * b + i) * b + j, (number * b + j) * b + i)]
+        out[at] = (left[at] @ values) @ np.swapaxes(right[at], 1, 2)
+    return out

@@ -77,9 +77,7 @@ def covariance_at(grid: spline.Grid, factor: blocks.Factor, xy: Float) -> Float:
     """Posterior covariance (N, 2, 2) of the gradient at any `xy` (N, 2) px."""
     index, p = spline.stencil(grid, xy, 1, 0)
     stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
-    inverse = blocks.selected_inverse(factor)
-    parts = [slice(k, k + 4096) for k in range(0, len(xy), 4096)]  # 256 numbers a point: bounded memory
-    return np.concatenate([blocks.covariance(inverse, index[k], stencil[k], stencil[k]) for k in parts])
+    return blocks.covariance(blocks.selected_inverse(factor), index, stencil, stencil)
 
 
 def _enlarge(coarse: Float, shape: tuple[int, int]) -> Float:
