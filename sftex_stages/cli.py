@@ -57,12 +57,11 @@ def _run(args: argparse.Namespace) -> int:
     params = _params(args)
     items, missing = _find(args)
     planner = pipeline.planner(args.out, params)
-    planner.store.prepare()
     with progress.watch(len(items)) as watcher:
         results = execute(planner, items, args.jobs, watcher)
     for notice in planner.store.notices:
         print(f"sftex: {notice}", file=sys.stderr)
-    rows = report.run_rows(results, args.out)
+    rows = report.run_rows(results, args.out, planner.store)
     failed = sum(row["status"] != "ok" for row in rows) + len(missing)
     code = OK if not failed else ALL_FAILED if failed == len(rows) + len(missing) else SOME_FAILED
     seconds = round(time.perf_counter() - started, 2)

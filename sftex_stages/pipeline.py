@@ -9,7 +9,8 @@ from typing import Any
 from . import cluster, config, detect, frontal, images, irradiance, surface
 from .engine.plan import Delivery, Item, Plan, Planner
 from .engine.stage import Arrays, Stage
-from .engine.store import Store
+from .engine.store import Store, read_receipt
+from .errors import StoreError
 from .results import VERSION as RESULTS_VERSION
 
 PIPELINE: tuple[Stage, ...] = (
@@ -22,15 +23,31 @@ def items(found: Sequence[images.ImageItem]) -> list[Item]:
     return [Item(image.name, {"image": image.path, "mask": image.mask}) for image in found]
 
 
-def planner(out: Path, params: config.Params, repair: bool = True) -> Planner:
-    """A planner of the whole pipeline with the store in ``out/.store`` and results in ``out/<image name>``."""
+def planner(
+    out: Path, params: config.Params, repair: bool = True, until: str | None = None, force: Sequence[str] = ()
+) -> Planner:
+    """A planner of the pipeline with the store in ``out/.store`` and results in ``out/<image name>``.
+
+    `until`: only this stage and what it needs, and no results. `force`: stages that are done again in any case.
+    """
     text = config.to_yaml(params, PIPELINE)
 
     def meta(item: Item, plan: Plan) -> dict[str, Any]:
         return describe(item, plan, text)
 
     delivery = Delivery(RESULTS_VERSION, deliver, ("image", "frontal", "surface", "irradiance"), out, meta)
-    return Planner(PIPELINE, params, Store(out / ".store"), delivery, repair)
+    whole = until in (None, delivery.name)
+    stages = PIPELINE if whole else needed(until)
+    return Planner(stages, params, Store(out / ".store"), delivery if whole else None, repair, frozenset(force))
+
+
+def needed(stage: str | None) -> list[Stage]:
+    """The stage and all that it needs, in order."""
+    wanted = {stage}
+    for other in reversed(PIPELINE):
+        if other.name in wanted:
+            wanted.update(other.inputs)
+    return [other for other in PIPELINE if other.name in wanted]
 
 
 def deliver(folder: Path, arrays: Mapping[str, Arrays | list[Arrays]], meta: dict[str, Any]) -> list[Path]:
@@ -57,12 +74,15 @@ def describe(item: Item, plan: Plan, config_yaml: str) -> dict[str, Any]:
     }
 
 
-def figures(plan: Plan) -> dict[str, Any]:
+def figures(plan: Plan, store: Store) -> dict[str, Any]:
     """Numbers for the table, from the receipts of a complete plan: instances, textons usable and tried."""
     textons = list(plan.steps["frontal"].done.values())
-    surface_arrays = plan.steps["surface"].done[None]["arrays"]
+    try:
+        receipt, _ = read_receipt(store.path("surface", plan.steps["surface"].keys[0], ".json"))
+    except (OSError, ValueError) as error:
+        raise StoreError(f"surface of {plan.item.name}: its receipt cannot be read ({error}); run sftex again") from error
     return {
-        "instances": surface_arrays["instance/xy"]["shape"][0],
+        "instances": receipt["arrays"]["instance/xy"]["shape"][0],
         "textons_used": sum(bool(receipt["scalars"]["usable"]) for receipt in textons),
         "textons": len(textons),
     }

@@ -10,22 +10,23 @@ from typing import Any
 from . import pipeline
 from .engine.execute import ItemResult, StageResult
 from .engine.plan import Plan, Step
+from .engine.store import Store
 
 Row = dict[str, Any]
 
 
-def run_rows(results: Sequence[ItemResult], out: Path) -> list[Row]:
+def run_rows(results: Sequence[ItemResult], out: Path, store: Store) -> list[Row]:
     """One JSON object per image of a run."""
-    return [_run_row(result, out) for result in results]
+    return [_run_row(result, out, store) for result in results]
 
 
-def _run_row(result: ItemResult, out: Path) -> Row:
+def _run_row(result: ItemResult, out: Path, store: Store) -> Row:
     row: Row = {"image": result.item.name, "path": str(result.item.files["image"]), "status": "ok"}
     if result.error:
         row.update(status="failed", error=result.error, log=str(result.log) if result.log else None)
     row["stages"] = {name: _stage_entry(name, state, result) for name, state in result.stages.items()}
     if not result.error and result.plan:
-        row.update(pipeline.figures(result.plan))
+        row.update(pipeline.figures(result.plan, store))
         folder = out / result.item.name
         receipt = result.plan.steps["outputs"].done[None]
         row.update(folder=str(folder), files=[str(folder / name) for name in receipt["files"]])

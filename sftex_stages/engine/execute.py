@@ -19,7 +19,7 @@ from typing import Protocol
 
 from ..errors import SftexError
 from .plan import Item, Job, Plan, Planner
-from .store import DamagedError
+from .store import DamagedError, Receipt
 from .worker import Outcome, Task, perform, start
 
 _MOST_ATTEMPTS = 3  # at one job: a store that loses what was just written is not worked around for ever
@@ -47,6 +47,11 @@ class ItemResult:
     failed_stage: str = ""
     log: Path | None = None
 
+    @property
+    def complete(self) -> bool:
+        """Everything that was asked for is there."""
+        return not self.error and self.plan is not None and self.plan.complete
+
 
 class Watcher(Protocol):
     """Is told, in the main thread, how far things are."""
@@ -58,15 +63,21 @@ class Watcher(Protocol):
         """The item is complete or failed."""
 
 
-def execute(planner: Planner, items: Sequence[Item], workers: int | None, watcher: Watcher) -> list[ItemResult]:
+def execute(
+    planner: Planner, items: Sequence[Item], workers: int | None, watcher: Watcher, fail_fast: bool = False
+) -> list[ItemResult]:
     """Bring all items up to date. `workers`: processes (None: as many as there are processors).
 
-    Starts no process if nothing has to be computed. Errors of jobs and items are in the results, never raised.
+    Starts no process, and writes nothing, if nothing has to be computed; StoreError if something has to be and the store
+    cannot be written. Errors of jobs and items are in the results, never raised. `fail_fast`: after the first of them no
+    further job is started; what is running is finished and kept.
     """
-    run = _Run(planner, items, watcher)
+    run = _Run(planner, items, watcher, fail_fast)
     for number in range(len(items)):
         run.advance(number)
-    while run.queue:
+    if run.queue and not run.stopped:
+        planner.store.prepare()
+    while run.queue and not run.stopped:
         _wave(run, workers)
     return run.results
 
@@ -82,9 +93,10 @@ class _Entry:
 class _Run:
     """The state of one run. `take` is called from joblib's thread, everything else from the main thread."""
 
-    def __init__(self, planner: Planner, items: Sequence[Item], watcher: Watcher) -> None:
+    def __init__(self, planner: Planner, items: Sequence[Item], watcher: Watcher, fail_fast: bool) -> None:
         names = [stage.name for stage in planner.stages] + ([planner.delivery.name] if planner.delivery else [])
         self.planner, self.watcher = planner, watcher
+        self.fail_fast, self.stopped = fail_fast, False
         self.depth = {name: number for number, name in enumerate(names)}
         self.results = [ItemResult(item, {name: StageResult() for name in names}) for item in items]
         self.queue: list[tuple[tuple[int, int, int], str]] = []  # heap of (priority, key)
@@ -133,7 +145,7 @@ class _Run:
         """Tasks, most urgent first, until the queue is empty."""
         while True:
             with self.lock:
-                if not self.queue:
+                if not self.queue or self.stopped:
                     return
                 entry = self.entries[heapq.heappop(self.queue)[1]]
                 if all(self.results[number].error for number in entry.items):
@@ -158,7 +170,8 @@ class _Run:
         if outcome.damage:
             outcome = self._set_aside(outcome, outcome.damage)
         if outcome.receipt:
-            self.planner.store.accept(job.stage, job.key, outcome.receipt)
+            self.planner.store.accept(job.stage, job.key)
+            self._compare(job, outcome.receipt)
         for number in entry.items:
             result = self.results[number]
             self.pending[number][job.stage] -= 1
@@ -175,6 +188,16 @@ class _Run:
                 self._tell(number, job.stage)
             if not self.pending[number].total():
                 self.advance(number)
+
+    def _compare(self, job: Job, receipt: Receipt) -> None:
+        """A forced job must have the outcome that it replaces: keys promise it."""
+        before = self.planner.replaced.pop(job.key, None)
+        if before and before != receipt["artefact"]["sha256"]:
+            part = "" if job.part is None else f" (part {job.part})"
+            self.planner.store.notices.append(
+                f"{job.item} {job.stage}{part}: computed again with another outcome than was cached; other versions of "
+                "libraries, or the stage changed without a new version, or it is not deterministic"
+            )
 
     def _tell(self, number: int, stage: str) -> None:
         jobs = self.results[number].stages[stage].jobs
@@ -195,6 +218,7 @@ class _Run:
             part = "" if job.part is None else f" (part {job.part})"
             result.failed_stage, error = job.stage, f"{job.stage}{part}: {error}"
         result.error, result.log = error, log
+        self.stopped = self.stopped or self.fail_fast
         self.watcher.finished(result)
 
 
@@ -216,7 +240,7 @@ def _alone(task: Task, planner: Planner) -> Outcome:
     """Run a suspect in a process of its own; if that dies too, the suspect is the killer."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    receipt, _ = planner.store.find(task.job.stage, task.job.key)
+    receipt = None if task.job.stage in planner.force else planner.store.find(task.job.stage, task.job.key)[0]
     if receipt:  # it was published just before the crash
         return Outcome(task.job, receipt=receipt)
     try:

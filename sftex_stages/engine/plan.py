@@ -3,19 +3,23 @@
 State is derived, each time, from the stages' records, the parameters, the source files and the receipts in the store.
 A stage's keys contain the hashes of its upstream artefacts, so they are known only once everything upstream is
 published: a plan ends in front of the first stage that has work to do, and is made again when that work is done.
-The same plan serves running, status and explaining.
+The same plan serves running, planning, status and explaining. An item's ledger saves looking again at what was found
+intact before.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from . import keys
+from . import keys, ledger
+from .keys import Identity
 from .stage import Arrays, Stage, StageParams
-from .store import Receipt, Store
+from .store import Receipt, Store, stamp
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class Job:
     stage: str
     part: int | None
     key: str
-    identity: keys.Identity
+    identity: Identity
     inputs: Mapping[str, Source | list[Source]]
     files: Mapping[str, str | None]  # paths
     folder: str | None = None  # of a delivery
@@ -76,6 +80,10 @@ class Step:
     done: dict[int | None, Receipt] = field(default_factory=dict)
     todo: list[tuple[Job, str]] = field(default_factory=list)  # with the reason in words
     keys: list[str] = field(default_factory=list)  # of all parts, in order
+    ahead: list[str] = field(default_factory=list)  # why it will run in any case, known while it still waits
+    expected: int | None = None  # number of jobs: the last run's while it waits, None if there was none
+    identity: Identity | None = None  # of all parts together
+    delivered: dict[str, str] = field(default_factory=dict)  # of a delivery: its intact files and their stamps
 
     @property
     def complete(self) -> bool:
@@ -102,6 +110,11 @@ class Plan:
         """Jobs that can run now, with reasons."""
         return [entry for step in self.steps.values() for entry in step.todo]
 
+    @property
+    def complete(self) -> bool:
+        """Nothing is left to do."""
+        return all(step.complete for step in self.steps.values())
+
 
 @dataclass
 class Planner:
@@ -111,18 +124,24 @@ class Planner:
     params: Mapping[str, StageParams]
     store: Store
     delivery: Delivery | None = None
-    repair: bool = True  # set damaged artefacts aside (False: only look)
+    repair: bool = True  # set damaged artefacts aside, keep ledgers (False: only look)
+    force: frozenset[str] = frozenset()  # stages that are done again even where they are cached
+    replaced: dict[str, str] = field(default_factory=dict)  # key -> SHA-256 of what a forced job is about to replace
     _hashes: dict[Path, str] = field(default_factory=dict)
-    _history: dict[str, dict[tuple[str, int | None], Receipt]] = field(default_factory=dict)
+    _ledgers: dict[str, ledger.Steps] = field(default_factory=dict)
 
     def plan(self, item: Item) -> Plan:
-        """The item's state now. InputError if a source file cannot be read."""
+        """The item's state now. InputError if a source file, StoreError if the store cannot be read."""
         hashes = {name: self._hash(path) for name, path in item.files.items()}
+        if item.name not in self._ledgers:
+            self._ledgers[item.name] = ledger.read(self.store.root, item.name)
         plan = Plan(item, {}, hashes)
         for stage in self.stages:
             plan.steps[stage.name] = self._step(stage, plan)
         if self.delivery:
             plan.steps[self.delivery.name] = self._delivery(self.delivery, plan)
+        if self.repair:
+            self._remember(plan)
         return plan
 
     def _hash(self, path: Path | None) -> str | None:
@@ -134,44 +153,57 @@ class Planner:
 
     def _step(self, stage: Stage, plan: Plan) -> Step:
         step = Step(stage.name, fanned=stage.fan_out is not None)
+        last = self._ledgers[plan.item.name].get(stage.name)
+        files = {name: plan.file_hashes[name] for name in stage.files}
         step.waits_for = next((name for name in stage.inputs if not plan.steps[name].complete), None)
         if step.waits_for:
+            identity = keys.job_identity(stage, self.params[stage.name], {}, files, None)
+            if last:
+                step.ahead = keys.differences({**last["identity"], "inputs": {}}, identity)
+                step.expected = len(last["jobs"])
+            if stage.name in self.force:
+                step.ahead.append("forced")
             return step
         inputs = {name: plan.steps[name].sources() for name in stage.inputs}
         upstream = {name: _content(sources) for name, sources in inputs.items()}
-        files = {name: plan.file_hashes[name] for name in stage.files}
         paths = {name: str(path) if (path := plan.item.files[name]) else None for name in stage.files}
-        identity = keys.job_identity(stage, self.params[stage.name], upstream, files, None)
+        identity = step.identity = keys.job_identity(stage, self.params[stage.name], upstream, files, None)
+        known = _known(last, identity)
         for part in _parts(stage, plan):
-            named = {**identity, "part": part}
-            key = keys.digest(named)
+            key, receipt, problem = self._look(stage.name, {**identity, "part": part}, known.get(part))
             step.keys.append(key)
-            receipt, problem = self.store.find(stage.name, key, self.repair)
+            if receipt and stage.name in self.force and (stage.name, key) not in self.store.fresh:
+                self.replaced[key] = receipt["artefact"]["sha256"]
+                receipt, problem = None, "forced"
             if receipt:
                 step.done[part] = receipt
             else:
+                named = {**identity, "part": part}
                 job = Job(plan.item.name, stage.name, part, key, named, inputs, paths)
                 step.todo.append((job, problem or self._why(job) or "not in the cache any more"))
+        step.expected = len(step.keys)
         return step
 
     def _delivery(self, delivery: Delivery, plan: Plan) -> Step:
-        step = Step(delivery.name)
+        step = Step(delivery.name, expected=1)
         step.waits_for = next((name for name, other in plan.steps.items() if not other.complete), None)
         if step.waits_for:
             return step
         inputs = {name: plan.steps[name].sources() for name in delivery.inputs}
         meta = delivery.meta(plan.item, plan)
         # the hashed inputs look like a stage's, with the meta data in place of parameters
-        identity = {
+        identity = step.identity = {
             "stage": delivery.name, "version": delivery.version, "params": {**meta, "folder": plan.item.name},
             "inputs": {name: _content(sources) for name, sources in inputs.items()}, "files": {}, "part": None,
         }  # fmt: skip
         folder = delivery.folder / plan.item.name
-        key = keys.digest(identity)
+        last = self._ledgers[plan.item.name].get(delivery.name)
+        key, receipt, problem = self._look(delivery.name, identity, _known(last, identity).get(None))
         step.keys.append(key)
-        receipt, problem = self.store.find(delivery.name, key, self.repair)
+        if receipt and delivery.name in self.force and (delivery.name, key) not in self.store.fresh:
+            receipt, problem = None, "forced"
         if receipt:
-            problem = _files_problem(folder, receipt["files"])
+            step.delivered, problem = _intact(folder, receipt["files"], last.get("files", {}) if last else {})
         if receipt and not problem:
             step.done[None] = receipt
         else:
@@ -180,18 +212,40 @@ class Planner:
             step.todo.append((job, self._why(job) or problem or "not in the cache any more"))
         return step
 
+    def _look(self, stage: str, identity: Identity, known: Receipt | None) -> tuple[str, Receipt | None, str]:
+        """Key, verified receipt (None: not done) and problem of one job; `known`: what the ledger says of it."""
+        if known and self.store.trust(stage, known):
+            return known["key"], known, ""
+        key = keys.digest(identity)
+        return key, *self.store.find(stage, key, self.repair)
+
     def _why(self, job: Job) -> str:
-        """Compare with the last result of the same image and stage; "" if there is no difference."""
-        if job.stage not in self._history:
-            self._history[job.stage] = self.store.history(job.stage)
-        previous = self._history[job.stage].get((job.item, job.part))
-        if previous is None:
+        """Compare with what the last run of the same item found; "" if there is no difference."""
+        last = self._ledgers[job.item].get(job.stage)
+        if last is None or all(part != job.part for part, _ in last["jobs"]):
             return "new"
-        return "; ".join(keys.differences(previous["identity"], job.identity))
+        return "; ".join(keys.differences(last["identity"], job.identity))
+
+    def _remember(self, plan: Plan) -> None:
+        """Bring the item's ledger up to date. A store that cannot be written keeps its old one, which does no harm."""
+        old = self._ledgers[plan.item.name]
+        steps = dict(old)
+        for name, step in plan.steps.items():
+            if step.complete and step.identity:
+                steps[name] = ledger.entry(step.identity, step.done, step.delivered)
+        if steps != old:
+            self._ledgers[plan.item.name] = steps
+            with contextlib.suppress(OSError):
+                ledger.write(self.store.root, plan.item.name, steps)
 
 
 def _content(sources: Source | list[Source]) -> str | list[str]:
     return [source.sha256 for source in sources] if isinstance(sources, list) else sources.sha256
+
+
+def _known(last: Mapping[str, Any] | None, identity: Identity) -> dict[int | None, Receipt]:
+    """The ledger's jobs of a stage, by part. The same identity has the same keys: they need not be worked out again."""
+    return {part: receipt for part, receipt in last["jobs"]} if last and last["identity"] == identity else {}
 
 
 def _parts(stage: Stage, plan: Plan) -> Sequence[int | None]:
@@ -201,12 +255,18 @@ def _parts(stage: Stage, plan: Plan) -> Sequence[int | None]:
     return range(int(receipt["scalars"]["count"]))
 
 
-def _files_problem(folder: Path, files: Mapping[str, str]) -> str:
-    """What is wrong with delivered files ({name: SHA-256}), "" if they are all intact."""
+def _intact(folder: Path, files: Mapping[str, str], known: Mapping[str, str]) -> tuple[dict[str, str], str]:
+    """Stamps of delivered files ({name: SHA-256}), and what is wrong with them ("" if nothing).
+
+    `known`: stamps of files that were found intact before; files that have them still are not hashed again.
+    """
+    stamps: dict[str, str] = {}
     for name, sha256 in files.items():
         path = folder / name
-        if not path.is_file():
-            return f"{name} is missing"
-        if keys.file_sha256(path) != sha256:
-            return f"{name} was changed"
-    return ""
+        try:
+            stamps[name] = stamp(os.stat(path))
+        except OSError:
+            return {}, f"{name} is missing"
+        if known.get(name) != stamps[name] and keys.file_sha256(path) != sha256:
+            return {}, f"{name} was changed"
+    return stamps, ""

@@ -5,17 +5,21 @@
     <root>/<stage>/<key[:2]>/<key>.h5     the arrays (HDF5)
     <root>/<stage>/<key[:2]>/<key>.json   the receipt: inputs, parameters, versions, duration, SHA-256 of the artefact
     <root>/<stage>/<key[:2]>/<key>.log    traceback of a failed attempt, until one succeeds
+    <root>/items/                         what the last run of every item found (see `ledger`)
+    <root>/runs/                          what runs reached, and which of them are pinned (see `runs`)
     <root>/crashes.log                    where processes died, if they could still tell
     <root>/damaged/                       what failed its checksum, set aside
     <root>/tmp/                           files being written
 
 Every file is written under a temporary name, synced and renamed, so it is there whole or not at all; no receipt means
-not done. There is no other state: nothing to get stuck, nothing to lock. Nothing is trusted that was not hashed: the
-receipt carries its own checksum, the artefact's SHA-256 is compared at every read.
+not done. No other state decides anything: nothing to get stuck, nothing to lock. Nothing is trusted that was not hashed:
+the receipt carries its own checksum, the artefact's SHA-256 is compared at every read.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -31,6 +35,7 @@ from ..errors import StoreError
 from . import keys
 
 Receipt = dict[str, Any]
+RESERVED = {"tmp", "damaged", "items", "runs"}  # folders of the store that are no stages
 _STALE_TEMPORARY = 24 * 3600  # seconds; younger ones may belong to another run
 
 
@@ -48,6 +53,7 @@ class Store:
 
     root: Path
     notices: list[str] = field(default_factory=list)  # what was set aside, in words
+    fresh: set[tuple[str, str]] = field(default_factory=set)  # (stage, key) published by this run
     _verified: dict[tuple[str, str], Receipt] = field(default_factory=dict)
 
     def path(self, stage: str, key: str, suffix: str = ".h5") -> Path:
@@ -73,44 +79,54 @@ class Store:
     def find(self, stage: str, key: str, repair: bool = True) -> tuple[Receipt | None, str]:
         """The verified receipt of a finished job, or None and the reason in words ("" if it simply was never done).
 
-        Damaged files are set aside (unless not `repair`), so that the job can be done again.
+        The receipt has an entry more than its file: "stamps", of the receipt's and of the artefact's file when their
+        bytes were hashed. Damaged files are set aside (unless not `repair`), so that the job can be done again.
         """
         if (stage, key) in self._verified:
             return self._verified[stage, key], ""
         try:
-            receipt = read_receipt(self.path(stage, key, ".json"))
-        except FileNotFoundError:
+            receipt, own = read_receipt(self.path(stage, key, ".json"))
+            if receipt["key"] != key or keys.digest(receipt["identity"]) != key:
+                raise ValueError("of another job")
+        except (FileNotFoundError, NotADirectoryError):
             return None, ""
-        except (OSError, ValueError) as error:
-            return None, self._damaged(stage, key, f"damaged receipt ({error})", repair)
+        except (OSError, ValueError, KeyError) as error:
+            return None, self._damaged(stage, key, f"damaged receipt ({_mendable(error)})", repair)
         try:
-            self._check_artefact(stage, key, receipt)
+            receipt["stamps"] = [own, self._check_artefact(stage, key, receipt)]
         except FileNotFoundError:
             return None, "artefact removed"
         except (OSError, ValueError) as error:
-            return None, self._damaged(stage, key, f"damaged artefact ({error})", repair)
+            return None, self._damaged(stage, key, f"damaged artefact ({_mendable(error)})", repair)
         self._verified[stage, key] = receipt
-        if repair:
-            self._used(stage, key)
         return receipt, ""
 
-    def _used(self, stage: str, key: str) -> None:
-        """Leave a trace of use in the receipt's file time: tells `history` what the last run used, nothing else."""
-        try:
-            os.utime(self.path(stage, key, ".json"))
-        except OSError:  # a store that may only be read
-            pass
+    def trust(self, stage: str, receipt: Receipt) -> bool:
+        """Accept a receipt that a ledger remembers, if its files are, for the file system, those that were hashed."""
+        place = stage, receipt["key"]
+        if place not in self._verified:
+            base = f"{self.root}/{stage}/{receipt['key'][:2]}/{receipt['key']}"
+            for stamped, suffix in zip(receipt["stamps"], (".json", ".h5"), strict=True):
+                try:
+                    if stamped is not None and stamp(os.stat(base + suffix)) != stamped:
+                        return False
+                except OSError:
+                    return False
+            self._verified[place] = receipt
+        return True
 
-    def _check_artefact(self, stage: str, key: str, receipt: Receipt) -> None:
+    def _check_artefact(self, stage: str, key: str, receipt: Receipt) -> str | None:
+        """The artefact's stamp, taken before its bytes are hashed; None for a job that left files elsewhere."""
         expected = receipt["artefact"]
-        if expected is None:  # a job that left files elsewhere (a delivery)
-            return
+        if expected is None:
+            return None
         with open(self.path(stage, key), "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size != expected["bytes"]:
-                raise ValueError(f"{size} bytes instead of {expected['bytes']}")
+            status = os.fstat(file.fileno())
+            if status.st_size != expected["bytes"]:
+                raise ValueError(f"{status.st_size} bytes instead of {expected['bytes']}")
             if hashlib.file_digest(file, "sha256").hexdigest() != expected["sha256"]:
                 raise ValueError("wrong SHA-256")
+        return stamp(status)
 
     def read_artefact(self, stage: str, key: str, sha256: str) -> bytes:
         """The artefact's bytes, verified. DamagedError if they are not those of the receipt."""
@@ -132,7 +148,8 @@ class Store:
         if image is not None:
             self._write(self.path(stage, key), image)
         self._write(self.path(stage, key, ".json"), json.dumps(receipt, indent=1, ensure_ascii=False).encode())
-        self.path(stage, key, ".log").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.path(stage, key, ".log").unlink()
         return receipt
 
     def write_log(self, stage: str, key: str, text: str) -> Path:
@@ -141,29 +158,20 @@ class Store:
         self._write(path, text.encode())
         return path
 
-    def accept(self, stage: str, key: str, receipt: Receipt) -> None:
-        """A worker has just published this: no need to hash it again in this run."""
-        self._verified[stage, key] = receipt
+    def accept(self, stage: str, key: str) -> None:
+        """This run has just published this: to be verified when it is next looked for, even if it was there before."""
+        self.fresh.add((stage, key))
+        self._verified.pop((stage, key), None)
 
     def reject(self, damage: DamagedError) -> None:
         """Set aside what a worker found damaged."""
         self._damaged(damage.stage, damage.key, f"damaged artefact ({damage.problem})", repair=True)
 
-    def history(self, stage: str) -> dict[tuple[str, int | None], Receipt]:
-        """The most recently used receipt of every (image label, part): only for explaining, never for keys."""
-        latest: dict[tuple[str, int | None], tuple[int, Receipt]] = {}
-        for path in self._receipts(stage):
-            try:
-                receipt, used = read_receipt(path), path.stat().st_mtime_ns
-            except (OSError, ValueError):
-                continue
-            label = receipt["label"], receipt["identity"]["part"]
-            if label not in latest or latest[label][0] < used:
-                latest[label] = used, receipt
-        return {label: receipt for label, (_, receipt) in latest.items()}
-
-    def _receipts(self, stage: str) -> Iterator[Path]:
-        return (self.root / stage).glob("??/*.json")
+    def receipts(self) -> Iterator[tuple[str, str]]:
+        """(stage, key) of all receipts, sorted."""
+        for path in sorted(self.root.glob("*/??/*.json")):
+            if path.parts[-3] not in RESERVED:
+                yield path.parts[-3], path.stem
 
     def _damaged(self, stage: str, key: str, problem: str, repair: bool) -> str:
         self._verified.pop((stage, key), None)
@@ -172,10 +180,9 @@ class Store:
         folder = self.root / "damaged"
         try:
             folder.mkdir(exist_ok=True)
-            for suffix in (".h5", ".json"):
-                path = self.path(stage, key, suffix)
-                if path.exists():
-                    os.replace(path, folder / f"{stage}-{key[:16]}-{time.time_ns()}{suffix}")
+            for suffix in (".json", ".h5"):
+                with contextlib.suppress(FileNotFoundError):  # another run may have been quicker
+                    os.replace(self.path(stage, key, suffix), folder / f"{stage}-{key[:16]}-{time.time_ns()}{suffix}")
         except OSError as error:
             raise StoreError(f"{folder}: a damaged artefact cannot be set aside ({error.strerror})") from error
         self.notices.append(f"{stage} {key[:12]}: {problem}; set aside in {folder}, computed again")
@@ -190,8 +197,8 @@ class Store:
             ) from error
 
 
-def write_atomically(path: Path, content: bytes, scratch: Path) -> None:
-    """Write under a temporary name in `scratch` (same file system), sync, rename: whole or not at all."""
+def write_atomically(path: Path, content: bytes, scratch: Path, durable: bool = True) -> None:
+    """Write under a temporary name in `scratch` (same file system), sync if `durable`, rename: whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch.mkdir(parents=True, exist_ok=True)
     temporary = scratch / uuid.uuid4().hex
@@ -199,20 +206,36 @@ def write_atomically(path: Path, content: bytes, scratch: Path) -> None:
         with open(temporary, "xb") as file:
             file.write(content)
             file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 
 
-def read_receipt(path: Path) -> Receipt:
-    """A receipt whose checksum is right; ValueError (in words) otherwise, OSError if it cannot be read."""
+def read_receipt(path: Path) -> tuple[Receipt, str]:
+    """A receipt whose checksum is right, and its file's stamp; ValueError (in words) otherwise, OSError if unreadable."""
+    with open(path, "rb") as file:
+        status, content = os.fstat(file.fileno()), file.read()
     try:
-        receipt = json.loads(path.read_bytes())
+        receipt = json.loads(content)
         checksum = receipt.pop("checksum")
-    except (ValueError, AttributeError, KeyError, TypeError) as error:
+    except (ValueError, AttributeError, KeyError, TypeError, RecursionError) as error:
         raise ValueError("not a receipt") from error
     if keys.digest(receipt) != checksum:
         raise ValueError("wrong checksum")
-    return {**receipt, "checksum": checksum}
+    return {**receipt, "checksum": checksum}, stamp(status)
+
+
+def stamp(status: os.stat_result) -> str:
+    """What changes, in a file system, when a file is written, replaced or moved."""
+    return f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
+
+
+def _mendable(error: Exception) -> Exception:
+    """Bad content and bad sectors can be computed again; a file that may not be read is another's mistake."""
+    if isinstance(error, OSError) and error.errno not in (errno.EIO, errno.EISDIR):
+        where = error.filename or "the store"
+        raise StoreError(f"{where}: cannot be read ({error.strerror}); check its permissions") from error
+    return error
