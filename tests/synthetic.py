@@ -51,11 +51,11 @@ def sideways(xy, size=320):
 
 
 def render(
-    normals=sphere, light=sideways, element=glyph, radius=13.0, pitch=32.0, size=320, aligned=False, seed=0, samples=4
+    normals=sphere, light=sideways, element=glyph, radius=13.0, pitch=32.0, size=320, aligned=False, seed=0, samples=3
 ) -> Scene:
     """Elements of `radius` px on a jittered raster, orthographic, each flat, box-filtered over its pixels.
 
-    `normals` and `light` take positions (N, 2). `aligned` prints every element with the tilt direction along one axis of its own.
+    `normals` and `light` take positions (N, 2). `aligned` prints all with the tilt along one axis of their own.
     """
     rng = np.random.default_rng(seed)
     axis = np.arange(pitch / 2 + 2, size - pitch / 2, pitch)

@@ -80,7 +80,7 @@ def test_members_far_from_their_centre_belong_to_none(rng):
 
 
 def test_members_of_another_size_belong_to_none(rng):
-    detect, group = planted(rng, groups=(60,), regions=(30,))
+    detect, _ = planted(rng, groups=(60,), regions=(30,))
     detect["frame"][5] *= 2.9
     detect["frame"][6] /= 2.9
     detect["frame"][70] *= 2.9

@@ -92,7 +92,9 @@ def test_orientation_follows_the_image():
 @pytest.mark.parametrize("shape", [(150, 200), (151, 203)])
 @pytest.mark.parametrize("megapixels", [0.0, 0.06, 1.2])
 def test_places_and_sizes_are_in_pixels_of_the_image_however_it_is_enlarged(shape, megapixels):
-    centres = np.array([[40.13, 40.37], [100.3, 41.7], [160.61, 45.18], [41.72, 100.59], [99.44, 104.08], [158.1, 102.6]])
+    centres = np.array(
+        [[40.13, 40.37], [100.3, 41.7], [160.61, 45.18], [41.72, 100.59], [99.44, 104.08], [158.1, 102.6]]
+    )
     sigmas = np.array([2.4, 2.7, 3.0, 3.3, 3.6, 4.0])
     params = detect.Params(min_megapixels=megapixels, regions=False)
     got = detect.run({"image": image(blobs(shape, centres, sigmas))}, params)

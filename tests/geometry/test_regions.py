@@ -94,7 +94,7 @@ def test_every_dot_is_found_once_though_two_windows_see_it(rng):
 def test_a_highlight_does_not_break_a_hole(rng):
     centre, frame = np.array([60.3, 55.8]), rotation(0.4) @ np.diag([9.0, 7.0]) @ rotation(-0.4)
     image = draw((120, 120), [(centre, frame)]).astype(float)
-    image += 190 * coverage(image.shape, ellipse(centre + [-5.5, -3.0], 2.2 * np.eye(2)))  # up to the rim
+    image += 190 * coverage(image.shape, ellipse(centre - np.array([5.5, 3.0]), 2.2 * np.eye(2)))  # up to the rim
     xy, found = find(np.clip(image, 0, 255).astype(np.uint8))
     at = nearest(xy, centre)
     assert np.linalg.norm(xy[at] - centre) < 0.6

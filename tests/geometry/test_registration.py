@@ -51,7 +51,7 @@ def scene(frames, gains, size=140):
         centre = np.array([size / 2 + 0.3 * k - 0.7, size / 2 - 0.2 * k])
         s = np.stack([x - centre[0], y - centre[1]], -1) @ np.linalg.inv(frame).T
         image[:, k * size : (k + 1) * size] = gain * texture(s)
-        centres[k] = centre + [k * size, 0]
+        centres[k] = centre + np.array([k * size, 0])
     return image, centres
 
 

@@ -310,7 +310,7 @@ def sheet(rng, side=7, pitch=44, size=1.6):
         values = light[k] * glyph(s @ np.linalg.inv(size * t[k]).T)
         tile = values.reshape(pitch, 3, pitch, 3).mean((1, 3))
         image[row * pitch : (row + 1) * pitch, column * pitch : (column + 1) * pitch] = tile[..., None]
-        centres[k] = offset + [column * pitch, row * pitch]
+        centres[k] = offset + np.array([column * pitch, row * pitch])
     return image, centres, t, light
 
 
