@@ -9,13 +9,13 @@ from sftex_stages.geometry import blocks, gaussian, spline, tensors
 
 Float = NDArray[np.floating]
 
-GAPS = 2.2  # reach of a measurement, in the typical (upper quartile) distance of a point from its nearest measurement
+GAPS = 2.7  # reach of a measurement, in the typical (median) distance of a point from its nearest measurement
 EXCESS = 2.0  # of the variance: neighbouring instances share errors that the posterior counts as independent
 WORST = 20.0  # degrees; a normal less certain than this is not reported
 
 
 def typical_gap(xy: Float, spacing: float) -> float:
-    """Upper quartile of the distance from the nearest of `xy` (N, 2), over the convex hull of them, px."""
+    """Median distance from the nearest of `xy` (N, 2) over the convex hull of them, px; large holes hardly count."""
     if len(xy) < 4:
         return spacing
     low, high = xy.min(0), xy.max(0)
@@ -25,7 +25,7 @@ def typical_gap(xy: Float, spacing: float) -> float:
     inside = Delaunay(hull, qhull_options="QJ").find_simplex(points) >= 0
     if not inside.any():
         return spacing
-    return float(np.quantile(cKDTree(xy).query(points[inside])[0], 0.75))
+    return float(np.quantile(cKDTree(xy).query(points[inside])[0], 0.5))
 
 
 def distance(seen: Float, at: Float) -> Float:
