@@ -43,6 +43,7 @@ class Params(StageParams):
 
     radius: float = Field(4.5, gt=1, le=20, description="radius of the first domain, in sizes (σ) of the interest point")
     region_radius: float = Field(1.6, gt=1, le=5, description="radius of the first domain, in radii of the region")
+    min_radius: float = Field(6.0, ge=0, le=50, description="least radius of the first domain, px of the image")
     max_growth: float = Field(2.2, ge=1, le=5, description="the domain may grow to this multiple of the first radius")
     iterations: int = Field(20, ge=5, le=100, description="EM iterations")
     affine_iterations: int = Field(6, ge=1, le=50, description="of which with free affine frames")
@@ -51,7 +52,7 @@ class Params(StageParams):
     noise_floor: float = Field(0.01, gt=0, lt=1, description="texton noise that no agreement undercuts, in units of contrast")
     trend_order: int = Field(1, ge=0, le=2, description="order of the polynomial trend of log scale (perspective)")
     max_metric_residual: float = Field(0.03, gt=0, description="a texton above is unusable")
-    max_metric_error: float = Field(0.2, gt=0, description="a texton whose stretch is known less well is unusable")
+    max_metric_error: float = Field(0.1, gt=0, description="a texton whose stretch is known less well is unusable")
     max_sigma: float = Field(8.0, gt=0, description="a texton whose typical normal error is larger (degrees) is unusable")
 
 
@@ -115,7 +116,9 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
 
     # one grid point is about one pixel of the pyramid level on which the first domain is 8 to 13 points in radius
     radius = params.region_radius if detect["kind"][members[0]] else params.radius
-    size = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0))))) * radius
+    unit = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0)))))
+    radius = max(radius, params.min_radius / unit)
+    size = unit * radius
     level = int(np.clip(np.ceil(np.log2(size / 9.0)), -1, 5))
     image = level_image(rgb, level)
     factor = 2.0**-level
