@@ -13,6 +13,7 @@ from .geometry.imaging import normal_of_tensor, tensor_of
 from .geometry.metric import (
     common_covariance,
     constraint_gap,
+    leading_bias,
     metric_covariance,
     metric_upgrade,
     noise_split,
@@ -184,13 +185,13 @@ def finish(
     tensor = tensor_of(frames_, scale)
     own = tensor_covariance(frames_, scale, strain_covariance(template, residual))
     gap, spread = constraint_gap(tensor, own)
-    factor_, scale_var = noise_split(gap, spread, inlier)
+    inflation, scale_var = noise_split(gap, spread, inlier)
     metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, circle is not None)
     common = common_covariance(frames_, where, scale, order, metric_cov)
-    cov = own * factor_ + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
+    cov = own * inflation + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
     projected, left, chi2 = project_tensors(tensor, cov)
-    # what is left of the departure from the trend after the registration's noise is the local scale's
-    scale = scale * np.exp(0.5 * gap * scale_var / (scale_var + factor_ * spread))
+    # each instance's own scale: the trend with the whole departure from it, its upward bias where λ1 ≈ λ2 taken off
+    scale = scale * np.sqrt(np.clip(1.0 + gap - leading_bias(tensor, inflation * spread), 0.1, 10.0))
     inlier = inlier * np.where(chi2 < 12.0, 1.0, np.exp(-0.5 * (chi2 - 12.0)))
     transform = with_tensor(frames_, projected, scale)
     normal = normal_of_tensor(projected)
@@ -226,7 +227,7 @@ def finish(
         "scale": scale.astype(np.float32),
         "tensor": tensor.astype(np.float32),
         "tensor_cov": cov.astype(np.float32),
-        "log_scale_sigma": (0.5 * np.sqrt(factor_ * spread)).astype(np.float32),
+        "log_scale_sigma": (0.5 * np.sqrt(inflation * spread)).astype(np.float32),
         "normal": normal.astype(np.float32),
         "normal_sigma": sigma.astype(np.float32),
         "inlier": inlier.astype(np.float32),

@@ -228,6 +228,12 @@ def constraint_gap(tensor: Array, cov: Array) -> tuple[Array, Array]:
     return l1 - 1.0, np.maximum(np.einsum("ni,nij,nj->n", grad, cov, grad), 1e-12)
 
 
+def leading_bias(tensor: Array, variance: Array) -> Array:
+    """How much noise of `variance` (N,) raises the larger eigenvalue of tensors (N, 3) on average, to second order."""
+    apart = np.hypot(tensor[:, 0] - tensor[:, 2], 2 * tensor[:, 1])
+    return variance / np.maximum(apart, 2 * np.sqrt(variance))
+
+
 def noise_split(gap: Array, variance: Array, weights: Array) -> tuple[float, float]:
     """(factor, scale variance): the spread of λ1 − 1 is factor × `variance` + 4 var(log s), by maximum likelihood.
 
