@@ -1,4 +1,4 @@
-"""The command line: ``sftex run | status | evaluate | config``.
+"""The command line: ``sftex run | plan | status | explain | evaluate | config``, and those of `storage`.
 
 Exit codes: 0 success, 1 a defect in sftex, 2 bad configuration or usage (nothing was computed), 3 some images failed
 and the others were delivered, 4 every image failed, 130 interrupted. Results go to stdout, the rest to stderr.
@@ -15,11 +15,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import __version__
-from .errors import InputError, SftexError
+from . import __version__, storage
+from .errors import InputError, SftexError, StoreError
 
 if TYPE_CHECKING:
-    from .engine.plan import Item
+    from .engine.plan import Item, Planner
     from .engine.stage import StageParams
 
 OK, DEFECT, USAGE, SOME_FAILED, ALL_FAILED, INTERRUPTED = 0, 1, 2, 3, 4, 130
@@ -50,48 +50,92 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from . import pipeline, progress, report
+    from . import config, pipeline, progress, report
+    from .engine import runs
     from .engine.execute import execute
 
     started = time.perf_counter()
     params = _params(args)
     items, missing = _find(args)
-    planner = pipeline.planner(args.out, params)
+    planner = pipeline.planner(args.out, params, until=args.stage, force=args.force)
     with progress.watch(len(items)) as watcher:
-        results = execute(planner, items, args.jobs, watcher)
-    for notice in planner.store.notices:
+        results = execute(planner, items, args.jobs, watcher, args.fail_fast)
+    notices = planner.store.notices
+    run = None
+    try:
+        text = config.to_yaml(params, pipeline.PIPELINE)
+        run = runs.record(planner.store.root, text, [result.plan for result in results if result.plan])
+    except StoreError as error:
+        notices.append(str(error))
+    for notice in notices:
         print(f"sftex: {notice}", file=sys.stderr)
     rows = report.run_rows(results, args.out, planner.store)
     failed = sum(row["status"] != "ok" for row in rows) + len(missing)
     code = OK if not failed else ALL_FAILED if failed == len(rows) + len(missing) else SOME_FAILED
     seconds = round(time.perf_counter() - started, 2)
     if args.json:
-        _print_json(exit_code=code, seconds=seconds, images=rows, not_found=missing, notices=planner.store.notices)
+        _print_json(exit_code=code, seconds=seconds, run=run, images=rows, not_found=missing, notices=notices)
     else:
         print(report.run_text(rows, missing))
-        print(f"\n{len(rows)} image{'s' * (len(rows) != 1)} in {seconds:.1f} s")
+        print(f"\n{len(rows)} image{'s' * (len(rows) != 1)} in {seconds:.1f} s" + (f"; run {run}" if run else ""))
     return code
 
 
+def _plan(args: argparse.Namespace) -> int:
+    from . import report
+
+    rows = report.status_rows(_plans(args, args.stage, args.force)[0])
+    if args.json:
+        _print_json(images=rows, stages=report.plan_summary(rows))
+    else:
+        print(report.plan_text(rows))
+    return SOME_FAILED if any("error" in row for row in rows) else OK
+
+
 def _status(args: argparse.Namespace) -> int:
-    from . import pipeline, report
+    from . import report
+
+    rows = report.status_rows(_plans(args)[0])
+    if args.json:
+        _print_json(images=rows)
+    else:
+        print(report.status_text(rows))
+    return SOME_FAILED if any("error" in row for row in rows) else OK
+
+
+def _explain(args: argparse.Namespace) -> int:
+    from . import report
+
+    args.images = [args.image]
+    plans, planner = _plans(args)
+    documents, texts = [], []
+    for name, plan, error in plans:
+        if plan is None:
+            raise InputError(error)
+        rows = report.explain_rows(plan, planner.store, args.stage)
+        documents.append({"image": name, "stages": rows})
+        texts.append((f"{name}\n" if len(plans) > 1 else "") + report.explain_text(rows))
+    if args.json:
+        _print_json(images=documents)
+    else:
+        print("\n\n".join(texts))
+    return OK
+
+
+def _plans(args: argparse.Namespace, until: str | None = None, force: Sequence[str] = ()) -> tuple[list[Any], Planner]:
+    """(image, plan or None, error) of every image, by the planner that also runs; nothing is touched."""
+    from . import pipeline
 
     params = _params(args)
     items, missing = _find(args)
-    planner = pipeline.planner(args.out, params, repair=False)
+    planner = pipeline.planner(args.out, params, repair=False, until=until, force=force)
     plans: list[Any] = []
     for item in items:
         try:
             plans.append((item.name, planner.plan(item), ""))
         except SftexError as error:
             plans.append((item.name, None, str(error)))
-    plans += [(message.split(":")[0], None, message) for message in missing]
-    rows = report.status_rows(plans)
-    if args.json:
-        _print_json(images=rows)
-    else:
-        print(report.status_text(rows))
-    return SOME_FAILED if any("error" in row for row in rows) else OK
+    return plans + [(message.split(":")[0], None, message) for message in missing], planner
 
 
 def _evaluate(args: argparse.Namespace) -> int:
@@ -162,9 +206,22 @@ def _parser() -> argparse.ArgumentParser:
     run = _command(commands, "run", _run, "reconstruct images (only what is not cached is computed)")
     _image_arguments(run)
     run.add_argument("--jobs", type=_positive, metavar="N", help="processes (default: one per processor)")
+    _selection(run)
+    going = run.add_mutually_exclusive_group()
+    going.add_argument("--keep-going", action="store_true", help="a failed image stops no other (default)")
+    going.add_argument("--fail-fast", action="store_true", help="start nothing more after the first failure")
+
+    plan = _command(commands, "plan", _plan, "show what a run would do: jobs, and why; computes nothing")
+    _image_arguments(plan)
+    _selection(plan)
 
     status = _command(commands, "status", _status, "show what is cached, what would run, and why; computes nothing")
     _image_arguments(status)
+
+    explain = _command(commands, "explain", _explain, "say why a stage would run again: old value → new value")
+    explain.add_argument("image", metavar="IMAGE", help="file")
+    explain.add_argument("stage", nargs="?", metavar="STAGE", type=_stage, help="this stage only, and its key's parts")
+    _run_options(explain)
 
     evaluate = _command(commands, "evaluate", _evaluate, "compare a result.h5 with the true surface")
     evaluate.add_argument("result", type=Path, metavar="RESULT", help="result.h5, or the folder that holds it")
@@ -173,7 +230,17 @@ def _parser() -> argparse.ArgumentParser:
 
     config = _command(commands, "config", _config, "print the complete configuration, with comments")
     config.add_argument("--config", type=Path, metavar="FILE", help="complete this file instead of the defaults")
+
+    def stored(name: str, function: Any, about: str) -> argparse.ArgumentParser:
+        return _command(commands, name, lambda args: function(args, _say(args)), about)
+
+    storage.add_parsers(stored)
     return parser
+
+
+def _say(args: argparse.Namespace) -> storage.Say:
+    """How a command of `storage` tells its outcome."""
+    return lambda document, text: _print_json(**document) if args.json else print(text)
 
 
 def _command(commands: Any, name: str, function: Any, about: str) -> argparse.ArgumentParser:
@@ -184,6 +251,10 @@ def _command(commands: Any, name: str, function: Any, about: str) -> argparse.Ar
 
 def _image_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGES", help="folders, files or globs")
+    _run_options(parser)
+
+
+def _run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("outputs"), metavar="DIR",
         help="results go to DIR/<image>/, the cache to DIR/.store (default: outputs)",
@@ -195,6 +266,23 @@ def _image_arguments(parser: argparse.ArgumentParser) -> None:
         "--masks", type=Path, metavar="DIR", help="folder of masks (default: <stem>.mask.png beside the image)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
+
+
+def _selection(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--stage", type=_stage, metavar="STAGE", help="only this stage and what it needs")
+    parser.add_argument(
+        "--force", type=_stage, metavar="STAGE", action="append", default=[],
+        help="compute this stage again even where it is cached (may be repeated)",
+    )  # fmt: skip
+
+
+def _stage(text: str) -> str:
+    from . import pipeline
+
+    names = [*(stage.name for stage in pipeline.PIPELINE), "outputs"]
+    if text not in names:
+        raise argparse.ArgumentTypeError(f"no stage is called {text!r}; there are {', '.join(names)}")
+    return text
 
 
 def _positive(text: str) -> int:

@@ -84,7 +84,7 @@ def test_status_before_during_and_after(here, sftex):
     assert code == cli.OK and not (here / "outputs").exists()
     entry = json.loads(out)["images"][0]["stages"]
     assert entry["image"] == {"state": "stale", "jobs": 1, "to_run": 1, "reasons": {"new": 1}}
-    assert entry["surface"] == {"state": "waiting", "waits_for": "image"}
+    assert entry["surface"] == {"state": "waiting", "waits_for": "image", "expected_jobs": None, "reasons": []}
     sftex("run", "in/a.png")
     _, out, _ = sftex("status", "in/a.png")
     assert out.splitlines()[1].split() == "a cached cached cached cached (3) cached cached cached".split()

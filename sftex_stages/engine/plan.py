@@ -185,9 +185,11 @@ class Planner:
         return step
 
     def _delivery(self, delivery: Delivery, plan: Plan) -> Step:
-        step = Step(delivery.name, expected=1)
+        last = self._ledgers[plan.item.name].get(delivery.name)
+        step = Step(delivery.name, expected=1 if last else None)
         step.waits_for = next((name for name, other in plan.steps.items() if not other.complete), None)
         if step.waits_for:
+            step.ahead = ["forced"] if delivery.name in self.force else []
             return step
         inputs = {name: plan.steps[name].sources() for name in delivery.inputs}
         meta = delivery.meta(plan.item, plan)
@@ -197,13 +199,15 @@ class Planner:
             "inputs": {name: _content(sources) for name, sources in inputs.items()}, "files": {}, "part": None,
         }  # fmt: skip
         folder = delivery.folder / plan.item.name
-        last = self._ledgers[plan.item.name].get(delivery.name)
         key, receipt, problem = self._look(delivery.name, identity, _known(last, identity).get(None))
         step.keys.append(key)
         if receipt and delivery.name in self.force and (delivery.name, key) not in self.store.fresh:
             receipt, problem = None, "forced"
         if receipt:
-            step.delivered, problem = _intact(folder, receipt["files"], last.get("files", {}) if last else {})
+            # what a file of an earlier delivery was known to hold says nothing if this one wants something else in it
+            same = last is not None and last["jobs"][0][1]["files"] == receipt["files"]
+            known = last.get("files", {}) if last and same else {}
+            step.delivered, problem = _intact(folder, receipt["files"], known)
         if receipt and not problem:
             step.done[None] = receipt
         else:
