@@ -109,7 +109,7 @@ def _uncapped(text: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;")
+    return re.sub(r"<(?=\w)", "&lt;", text.replace("|", "\\|"))  # a < before a letter would begin an HTML tag
 
 
 PARTS: Mapping[str, Callable[[], str]] = {
