@@ -10,6 +10,7 @@ from sftex_stages.geometry.metric import (
     common_covariance,
     constraint_gap,
     gram_lift,
+    leading_bias,
     leading_eigenpair,
     linear_start,
     metric_covariance,
@@ -301,6 +302,20 @@ def test_constraint_gap_and_its_variance_against_finite_differences(rng):
     gap, variance = constraint_gap(tensor, cov)
     assert gap == pytest.approx(largest(tensor) - 1)
     assert variance == pytest.approx(np.einsum("ni,nij,nj->n", grad, cov, grad), rel=1e-6)
+
+
+@pytest.mark.parametrize("cos, noise", [(0.9, 0.02), (0.7, 0.05), (0.4, 0.05)])
+def test_bias_of_the_larger_eigenvalue_is_that_of_sampling(rng, cos, noise):
+    tensor = np.array([cos**2, 0.0, 1.0]) + noise * rng.normal(size=(100_000, 3))
+    gap, _ = constraint_gap(tensor, np.tile(np.eye(3), (len(tensor), 1, 1)))
+    assert leading_bias(tensor, np.full(len(tensor), noise**2)).mean() == pytest.approx(gap.mean(), rel=0.15)
+
+
+def test_bias_of_a_frontal_instance_is_never_overdone(rng):
+    """Where the second order fails, the bias is of the order of the noise and less than it really is."""
+    tensor = np.array([1.0, 0.0, 1.0]) + 0.02 * rng.normal(size=(100_000, 3))
+    gap, _ = constraint_gap(tensor, np.tile(np.eye(3), (len(tensor), 1, 1)))
+    assert 0.25 * gap.mean() < leading_bias(tensor, np.full(len(tensor), 4e-4)).mean() < gap.mean()
 
 
 @pytest.mark.parametrize("factor, scale", [(20.0, 0.05), (4.0, 0.1), (60.0, 0.0), (2.0, 0.0)])
