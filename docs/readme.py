@@ -53,7 +53,7 @@ def commands() -> str:
             if isinstance(action, argparse._HelpAction):
                 continue
             spelled = _spelled(action)
-            words.append(f"[{spelled}]" if action.option_strings and not action.required else spelled)
+            words.append(spelled if action.required else f"[{spelled}]")  # argparse asks for positionals unless "?"
             if action.option_strings:
                 options.setdefault(spelled, _cell(action.help or ""))
         rows.append(f"| `{' '.join(words)}` | {_cell(about[name])} |")
