@@ -18,6 +18,7 @@ from .geometry.metric import (
     metric_upgrade,
     noise_split,
     project_tensors,
+    turn_variance,
 )
 from .geometry.registration import patch_grid, register, sample
 from .geometry.texton import (
@@ -111,8 +112,9 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """Estimate the texton of one cluster. Inputs `image`, `detect`, `cluster`, `part`."""
     rgb, detect = inputs["image"]["rgb"], inputs["detect"]
     members = np.flatnonzero(inputs["cluster"]["label"] == int(inputs["part"]))
-    if len(members) < 3:
-        return empty(f"only {len(members)} instances; three are the least that fix a frontal view")
+    if len(members) < 4:
+        # three views leave a second metric frame as a rule (the preserved directions of the two need not agree); a fourth decides
+        return empty(f"only {len(members)} instances; four are the least that fix one frontal view")
     xy0, frames0 = detect["xy"][members].astype(np.float64), detect["frame"][members].astype(np.float64)
 
     # one grid point is about one pixel of the pyramid level on which the first domain is 8 to 13 points in radius
@@ -120,10 +122,10 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     unit = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0)))))
     radius = max(radius, params.min_radius / unit)
     size = unit * radius
-    level = int(np.clip(np.ceil(np.log2(size / 9.0)), -1, 5))
+    level = int(np.clip(np.ceil(np.log2(size / 13.0)), -1, 5))
     image = level_image(rgb, level)
     factor = 2.0**-level
-    half = int(np.clip(round(size * factor), 6, 9))
+    half = int(np.clip(round(size * factor), 6, 13))
     xy = (xy0 + 0.5) * factor - 0.5
     frames = frames0 * (radius * factor / half)
     extent = np.array([rgb.shape[1], rgb.shape[0]], float)
@@ -143,7 +145,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     texton = estimate_texton(image, xy[few], frames[few], where0[few], settings)
     if texton is None:
         return empty("no three of its patches look alike")
-    return finish(image, texton, xy, frames, where0, members, few, factor, params)
+    return finish(image, texton, xy, frames, where0, members, few[texton.founders], factor, params)
 
 
 def finish(
@@ -153,23 +155,25 @@ def finish(
     frames: Array,
     where: Array,
     members: Indices,
-    few: Indices,
+    founders: Indices,
     factor: float,
     params: Params,
 ) -> Arrays:
     """Register all members to the finished texton and report them with their uncertainties."""
     template = texton.template
     start_xy, start_frames = xy.copy(), frames.copy()
-    if len(few) < len(members):
+    if len(founders) < len(members):
         # detector frames differ from the texton's by one common map: learn it from the founders
         good = texton.inlier > 0.8
         if good.sum() >= 3:
-            relative = np.linalg.solve(frames[few][good], texton.frames[good])
+            relative = np.linalg.solve(frames[founders][good], texton.frames[good])
             common = np.median(relative, axis=0)
-            shift = np.median(np.linalg.solve(frames[few][good], (texton.xy[good] - xy[few][good])[..., None])[..., 0], axis=0)
+            shift = np.median(
+                np.linalg.solve(frames[founders][good], (texton.xy[good] - xy[founders][good])[..., None])[..., 0], axis=0
+            )
             start_frames = frames @ common
             start_xy = xy + np.einsum("mij,j->mi", frames, shift)
-    start_xy[few], start_frames[few] = texton.xy, texton.frames
+    start_xy[founders], start_frames[founders] = texton.xy, texton.frames
     got = register(image, template, start_xy, start_frames, steps=10)
     residual = got.residual
     contrast2 = weighted_contrast(template)
@@ -186,7 +190,8 @@ def finish(
     own = tensor_covariance(frames_, scale, strain_covariance(template, residual))
     gap, spread = constraint_gap(tensor, own)
     inflation, scale_var = noise_split(gap, spread, inlier)
-    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, circle is not None)
+    turn = turn_variance(tensor, own * inflation)
+    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, turn, circle is not None)
     common = common_covariance(frames_, where, scale, order, metric_cov)
     cov = own * inflation + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
     projected, left, chi2 = project_tensors(tensor, cov)
@@ -202,7 +207,7 @@ def finish(
     metric_error = float(np.sqrt(np.linalg.eigvalsh(metric_cov[:3, :3])[-1]))
     reason = ""
     typical = float(np.median(sigma[good])) if good.any() else np.inf
-    if good.sum() < 3:
+    if good.sum() < 4:
         reason = f"only {int(good.sum())} instances agree with it"
     elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circle is not None else 1.0):
         reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
@@ -215,7 +220,7 @@ def finish(
         "reason": np.array(reason),
         "appearance": texton.values.astype(np.float32),
         "domain": texton.weights.astype(np.float32),
-        "spacing": np.array(1.0 / factor, np.float32),
+        "spacing": np.array(texton.spacing / factor, np.float32),
         "progress": progress(image, texton),
         "progress_iterations": np.array([h[0] for h in texton.history], np.int32),
         "metric_residual": np.array(upgrade.residual, np.float32),
@@ -281,7 +286,7 @@ def progress(image: Array, texton: Estimate) -> Array:
         weight = texton.inlier[:, None, None]
         a = np.einsum("mji,mjk->ik", frames * weight, frames)
         b = np.einsum("mji,mjk->ik", frames * weight, texton.frames)
-        patches = sample(image, xy, frames @ np.linalg.solve(a, b), patch_grid(texton.half, 1.0))
+        patches = sample(image, xy, frames @ np.linalg.solve(a, b), patch_grid(texton.half, texton.spacing))
         gain = np.maximum(patches.mean((1, 2)), 1e-6)
         mean, _ = weighted_mean(patches, gain / np.median(gain), inlier + 1e-9)
         pictures.append(mean.reshape(n, n, -1))

@@ -180,12 +180,19 @@ def _refine(g: Array, basis: Array, weights: Array, gram: Array, shape: Array, s
 
 
 def metric_covariance(
-    frames: Array, where: Array, weights: Array, order: int, residual: float, circular: bool = False
+    frames: Array,
+    where: Array,
+    weights: Array,
+    order: int,
+    residual: float,
+    turn: Array | float = 0.0,
+    circular: bool = False,
 ) -> Array:
     """Covariance (8, 8) of (M11, M12, M22, trend) around M = I, for frames (N, 2, 2) that are metric already.
 
-    `residual` is the standard deviation of one instance's log σ_max. Where all instances keep nearly the same direction of
-    the element (section 2.2.2) it is large, and says along which stretch of the element.
+    `residual` is the standard deviation of one instance's log σ_max, `turn` (N,) the variance (rad²) of the direction that
+    keeps its length (`turn_variance`): directions that differ by their noise alone are one direction. Where all instances
+    keep nearly the same direction of the element (section 2.2.2) it is large, and says along which stretch of the element.
     """
     l1, _, u = leading_eigenpair(frames @ np.swapaxes(frames, -1, -2))
     v = np.einsum("nji,nj->ni", frames, u) / np.sqrt(np.maximum(l1, 1e-9))[:, None]
@@ -198,8 +205,21 @@ def metric_covariance(
     # a circular element has one freedom, its size
     basis = np.eye(8) if not circular else np.vstack([[1.0, 0, 1, 0, 0, 0, 0, 0], np.eye(8)[3:]])
     prior = np.diag(np.r_[np.full(len(basis) - 5, 1.0), np.full(5, 1 / _TREND_SIGMA**2)])
-    full = full @ basis.T
-    return basis.T @ np.linalg.inv(full.T @ (w[:, None] * full) / variance + prior) @ basis
+    information = full.T @ (w[:, None] * full)
+    # noise of v makes its directions seem to differ: what it adds to their scatter is taken off (errors in variables)
+    slope = np.stack([-v[:, 0] * v[:, 1], v[:, 0] ** 2 - v[:, 1] ** 2, v[:, 0] * v[:, 1]], -1)
+    information[:3, :3] -= slope.T @ ((w * turn)[:, None] * slope)
+    values, vectors = np.linalg.eigh(basis @ information @ basis.T)
+    information = (vectors * np.maximum(values, 0)) @ vectors.T
+    return basis.T @ np.linalg.inv(information / variance + prior) @ basis
+
+
+def turn_variance(tensor: Array, cov: Array) -> Array:
+    """Variance (N,), rad², of the leading direction of tensors (N, 3) with covariance (N, 3, 3); 0.5 where it is unknown."""
+    l1, l2, u = leading_eigenpair(tensor[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+    across = np.stack([-u[:, 0] * u[:, 1], u[:, 0] ** 2 - u[:, 1] ** 2, u[:, 0] * u[:, 1]], -1)
+    variance = np.einsum("ni,nij,nj->n", across, cov, across)
+    return np.minimum(variance / np.maximum((l1 - l2) ** 2, 1e-12), 0.5)
 
 
 def common_covariance(frames: Array, where: Array, scale: Array, order: int, cov: Array) -> Array:

@@ -146,21 +146,25 @@ def register(
 ) -> Registered:
     """Affine registration of M patches to a template, the gain solved for.
 
-    Levenberg–Marquardt per instance: a step that raises the residual is taken back and damped more.
+    Levenberg–Marquardt per instance: a step that raises the residual is taken back and damped more; an instance whose
+    step is under 1/1000 of the element rests.
     """
     solver = make_solver(template)
     points = template.points[solver.used]
+    xy, frames = xy.copy(), frames.copy()
     lam = np.full(len(xy), damping)
     projected, gain, residual = explain(template, solver, sample(image, xy, frames, points))
+    active = np.arange(len(xy))
     for _ in range(steps):
-        step = solve_step(template, solver, projected, gain, lam, limit)
-        new_xy, new_frames = compose_step(xy, frames, step)
+        step = solve_step(template, solver, projected[active], gain[active], lam[active], limit)
+        new_xy, new_frames = compose_step(xy[active], frames[active], step)
         new = explain(template, solver, sample(image, new_xy, new_frames, points))
-        better = new[2] < residual
-        lam = np.clip(np.where(better, lam * 0.3, lam * 10), 1e-6, 1e3)
-        xy, frames = np.where(better[:, None], new_xy, xy), np.where(better[:, None, None], new_frames, frames)
-        projected = np.where(better[:, None], new[0], projected)
-        gain, residual = np.where(better, new[1], gain), np.where(better, new[2], residual)
-        if np.abs(step / solver.unit)[better].max(initial=0) < 1e-4:
+        better = new[2] < residual[active]
+        lam[active] = np.clip(np.where(better, lam[active] * 0.3, lam[active] * 10), 1e-6, 1e3)
+        moved = active[better]
+        xy[moved], frames[moved] = new_xy[better], new_frames[better]
+        projected[moved], gain[moved], residual[moved] = (part[better] for part in new)
+        active = active[np.abs(step / solver.unit).max(1) > 1e-3]
+        if len(active) == 0:
             break
     return Registered(xy, frames, gain, residual)

@@ -39,6 +39,8 @@ class Estimate(NamedTuple):
     values: Array  # (n, n, C) µ
     weights: Array  # (n, n)
     half: int
+    spacing: float  # pixels between grid points of `values`
+    founders: NDArray[np.integer]  # (M,) which of the instances handed in are left
     xy: Array  # (M, 2)
     frames: Array  # (M, 2, 2)
     inlier: Array  # (M,) posterior of δ_i
@@ -74,11 +76,12 @@ def seed_members(patches: Array, window: Array) -> Array:
 def weighted_mean(patches: Array, gain: Array, weights: Array) -> tuple[Array, Array]:
     """Mean and variance over instances of the patches divided by their gain: (P, C), (P,)."""
     share = weights / weights.sum()
-    lit = patches / gain[:, None, None]
-    mean = np.einsum("m,mpc->pc", share, lit)
+    flat = patches.reshape(len(patches), -1)
+    mean = ((share / gain).astype(np.float32) @ flat).reshape(patches.shape[1:])
+    square = ((share / gain**2).astype(np.float32) @ np.square(flat)).reshape(patches.shape[1:])
     effective = 1 / (share**2).sum()
-    var = np.einsum("m,mpc->p", share, (lit - mean) ** 2) / lit.shape[2] * effective / max(effective - 1, 0.5)
-    return mean, var
+    var = np.maximum(square - mean**2, 0).mean(1) * effective / max(effective - 1, 0.5)
+    return mean.astype(np.float64), var.astype(np.float64)
 
 
 def posterior(residual: Array, noise2: float, contrast2: float, prior: float, samples: float) -> Array:
@@ -142,9 +145,10 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
     weights, noise2, prior, contrast2 = window, 0.0, 0.7, 1.0
     history: list[tuple[int, Array, Array, Array]] = []
     scale = np.ones(len(xy))
-    last_growth, held = 0, False
+    last_growth, spacing = 0, 1.0
+    founders: NDArray[np.integer] = np.arange(len(xy))
     for iteration in range(1, settings.iterations + 1):
-        template = make_template(values.reshape(n, n, -1), weights, 1.0)
+        template = make_template(values.reshape(n, n, -1), weights, spacing)
         contrast2 = weighted_contrast(template)
         # M-step for the transforms and gains, E-step for δ, all from the patches in hand
         step, gain, residual = registration_step(template, patches, _DAMPING)
@@ -158,33 +162,54 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         if inlier.sum() < 2.5:
             return None
         xy, frames = compose_step(xy, frames, step)
+        if iteration == settings.affine_iterations:
+            # what is no view of this element by now is left to the last registration
+            keep = inlier > 1e-3
+            founders = founders[keep]
+            xy, frames, inlier, gain = xy[keep], frames[keep], inlier[keep], gain[keep]
+            residual, step = residual[keep], step[keep]
+            where = where[keep]
+            history = [(k, a[keep], b[keep], c[keep]) for k, a, b, c in history]
         if iteration >= settings.affine_iterations:
-            order = settings.trend_order if len(xy) >= 12 else 0
-            upgrade = metric_upgrade(frames, where, inlier + 1e-6, order, warm=held, circle=circle_of(template))
-            held = True
-            frames, scale = frames @ np.linalg.cholesky(upgrade.gram), np.exp(upgrade.log_scale)
+            since = iteration - settings.affine_iterations
+            if since % _UPGRADE_EVERY == 0:
+                order = settings.trend_order if len(xy) >= 12 else 0
+                upgrade = metric_upgrade(
+                    frames, where, inlier + 1e-6, order, 30 if since == 0 else 5, since > 0, circle_of(template)
+                )
+                frames, scale = frames @ np.linalg.cholesky(upgrade.gram), np.exp(upgrade.log_scale)
             frames = hold_to_manifold(frames, scale, template, residual)
             # the normal that an element tells is the one where its detail lies, not where the detector put its point
             xy = xy + frames @ information_centre(template)
-            if iteration - last_growth >= 2 and half < settings.half_limit:
+            if iteration - last_growth >= 2 and half * spacing < settings.half_limit:
                 if grow(values, var, half, settings.agreement, contrast2):
-                    half, last_growth = min(settings.half_limit, int(np.ceil(half * 1.3))), iteration
-                    n = 2 * half + 1
+                    reach, last_growth = min(1.3 * half * spacing, settings.half_limit), iteration
+                    half = min(int(np.ceil(reach)), _HALF)
+                    spacing, n = max(1.0, reach / half), 2 * half + 1
         if iteration in PROGRESS:
             history.append((iteration, xy, frames, inlier))
         # M-step for the appearance
-        patches = sample(image, xy, frames, patch_grid(half, 1.0))
+        patches = sample(image, xy, frames, patch_grid(half, spacing))
         gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
         values, var = weighted_mean(patches, gain, inlier * _sharpness(frames))
         weights = domain_weights(values, var, half, 0.1, settings.agreement)
         if (weights > 0).sum() < 9:
             return None
-    template = make_template(values.reshape(n, n, -1), weights, 1.0)
+        settled = iteration >= max(settings.affine_iterations, last_growth) + 2 * _UPGRADE_EVERY
+        if settled and np.median(np.abs(step[inlier > 0.5, :4]).max(1)) < _SETTLED:
+            break
+    # EM that has settled would not change any more: its last state stands for the iterations that were not needed
+    history += [(k, xy, frames, inlier) for k in PROGRESS if iteration < k <= settings.iterations]
+    template = make_template(values.reshape(n, n, -1), weights, spacing)
     noise = float(np.sqrt(noise2))
-    return Estimate(template, values.reshape(n, n, -1), weights, half, xy, frames, inlier, noise, prior, history)
+    values = values.reshape(n, n, -1)
+    return Estimate(template, values, weights, half, spacing, founders, xy, frames, inlier, noise, prior, history)
 
 
 _DAMPING = 1e-3
+_UPGRADE_EVERY = 3  # iterations on the manifold between metric upgrades
+_SETTLED = 3e-3  # strain of a step that moves no edge of an element by a twentieth of a pixel
+_HALF = 15  # a domain of more grid points is sampled more coarsely: large elements have large detail
 _CIRCLE = 0.03  # a turn that costs less than this share of the next strain is none
 
 

@@ -18,6 +18,7 @@ from sftex_stages.geometry.metric import (
     noise_split,
     project_tensors,
     trend_basis,
+    turn_variance,
 )
 from sftex_stages.geometry.registration import make_template, patch_grid
 from sftex_stages.geometry.texton import centre_window, marginal_strain
@@ -384,3 +385,31 @@ def test_chi2_of_the_distance_has_one_degree_of_freedom(rng):
     chi2 = project_tensors(noisy, cov)[2]
     assert chi2.mean() == pytest.approx(1, abs=0.1)
     assert (chi2 > 3.841).mean() == pytest.approx(0.05, abs=0.02)
+
+
+def test_directions_that_differ_by_noise_alone_are_one_direction(rng):
+    n, noise = 60, 0.02
+    where, weights = rng.uniform(-1, 1, (n, 2)), np.ones(n)
+    tilted = compose(np.full(n, 0.4), np.full(n, np.radians(25)), np.zeros(n))
+    noisy = tilted @ (np.eye(2) + noise * rng.normal(size=(n, 2, 2)))
+    strain = np.tile(noise**2 * np.diag([4.0, 2, 4]), (n, 1, 1))
+    lift = gram_lift(noisy)
+    turn = turn_variance(tensor_of(noisy), lift @ strain @ np.swapaxes(lift, 1, 2))
+    found = metric_covariance(noisy, where, weights, 0, 0.002, turn)[:3, :3]
+    assert np.sqrt(np.linalg.eigvalsh(found)[-1]) > 0.3
+    generic = transforms(rng, n, 20, 60)
+    before, after = (
+        metric_covariance(generic, where, weights, 0, 0.005, t)[:3, :3] for t in (0.0, np.full(n, 0.05**2))
+    )
+    assert after == pytest.approx(before, rel=0.1, abs=1e-6)
+
+
+def test_turn_variance_is_the_scatter_of_the_direction(rng):
+    t = compose(0.7, np.radians(40), 1.0)
+    cov = 1e-4 * np.array([[4, 0.5, 1], [0.5, 2, 0.3], [1, 0.3, 3]])
+    tensor = tensor_of(t) + rng.multivariate_normal(np.zeros(3), cov, 20_000)
+    u = leading_eigenpair(tensor[:, [0, 1, 1, 2]].reshape(-1, 2, 2))[2]
+    across = np.array([np.cos(0.7), np.sin(0.7)])  # the tilt; the leading direction is square to it
+    angle = np.arcsin(u @ across * np.sign(u @ [-across[1], across[0]]))
+    assert turn_variance(tensor_of(t)[None], cov[None])[0] == pytest.approx(angle.var(), rel=0.1)
+    assert turn_variance(np.array([[1.0, 0, 1]]), cov[None])[0] == 0.5

@@ -330,8 +330,10 @@ def test_texton_from_detector_frames_finds_normals_and_outliers(rng):
     start_xy[wrong] += 22.0
     texton = estimate_texton(image, start_xy, start, np.zeros((n, 2)), SETTINGS)
     assert texton is not None
+    # what lies on nothing is left out of the founders, or not believed
+    wrong, t = wrong[texton.founders], t[texton.founders]
     right = ~wrong & (texton.inlier > 0.8)
-    assert right.sum() > 0.85 * (~wrong).sum() and texton.inlier[wrong].max() < 0.2
+    assert right.sum() > 0.85 * (n - n // 5) and texton.inlier[wrong].max(initial=0) < 0.2
     scale = np.median(np.linalg.svd(texton.frames[right], compute_uv=False)[:, 0])
     found, truth = (normal_of_tensor(tensor_of(f)) for f in (texton.frames[right] / scale, t[right]))
     error = np.minimum(normal_angle(found, truth), normal_angle(found * [-1, -1, 1], truth))
