@@ -20,69 +20,67 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from . import measures
 from .errors import InputError
+from .guarded import read_hdf5
 from .measures import angle, relative_to_ray, spread, unit
 
 ACCEPTED = 0.8  # posterior of an instance above which it counts (the paper, section 4)
 MAX_SLANT = 60.0  # degrees: true instances beyond are not asked for (interest points fade there, section 1.3)
 
 
+_NAMES = {
+    "truth": (
+        "surface/valid", "surface/normals", "surface/height", "irradiance/map",
+        "instances/xy", "instances/texton", "instances/normal", "instances/radius_px",
+    ),
+    "result": (
+        "surface/valid", "surface/normals", "surface/height", "surface/normal_sigma", "surface/piece",
+        "irradiance/map", "instances/xy", "instances/normal", "instances/normal_sigma", "instances/inlier",
+        "instances/irradiance", "instances/texton",
+    ),
+}  # fmt: skip
+
+
 class _File:
-    """A result or truth file, read-only, with errors that name the file and the dataset."""
+    """A result or truth file, with errors that name the file and the dataset. Read in a guarded way."""
 
     def __init__(self, path: Path, what: str):
         self.path, self.what = path, what
-        if not path.is_file():
-            raise InputError(f"{path}: no such {what} file")
-        try:
-            self.file = h5py.File(path, "r", locking=False)
-        except OSError as e:
-            raise InputError(f"{path}: not a readable HDF5 file ({e}); a {what} file is expected") from e
-
-    def __enter__(self) -> _File:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.file.close()
+        self.attrs, self.arrays = read_hdf5(path, _NAMES[what], what=what)
 
     def has(self, name: str) -> bool:
-        return name in self.file
+        """Whether there is a dataset `name`, or any in a group of that name."""
+        return any(known == name or known.startswith(f"{name}/") for known in self.arrays)
 
     def array(self, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
-        """Dataset `name` of this shape (None: any length), checked before it is read."""
-        node: Any = self.file
-        for part in name.split("/"):
-            link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
-            node = node[part] if isinstance(link, h5py.HardLink) else None
-        if isinstance(node, h5py.Dataset) and (node.is_virtual or node.external):
-            raise InputError(f"{self.path}: {name} takes its numbers from another file; such files are not read")
-        if not isinstance(node, h5py.Dataset):
+        """Dataset `name` of this shape (None: any length)."""
+        array = self.arrays.get(name)
+        if array is None or array.dtype.kind not in "biuf":
             raise InputError(f"{self.path}: dataset {name} is missing; is this a {self.what} file of sftex?")
-        same = len(node.shape) == len(shape)
-        if not same or any(b is not None and a != b for a, b in zip(node.shape, shape, strict=True)):
+        if array.ndim != len(shape) or any(b is not None and a != b for a, b in zip(array.shape, shape, strict=True)):
             wanted = " × ".join("any" if n is None else str(n) for n in shape)
-            raise InputError(f"{self.path}: {name} has the shape {' × '.join(map(str, node.shape))}, expected {wanted}")
-        try:
-            return np.asarray(node[()])
-        except OSError as e:
-            raise InputError(f"{self.path}: {name} cannot be read ({e}); the file is damaged") from e
+            raise InputError(
+                f"{self.path}: {name} has the shape {' × '.join(map(str, array.shape))}, expected {wanted}"
+            )
+        return array
 
     def camera(self) -> tuple[float, np.ndarray] | None:
         """(focal length, principal point), px, or None for an orthographic camera."""
-        attrs = self.file.attrs
-        kind = attrs.get("camera", "orthographic")
-        kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+        attrs = self.attrs
+        kind = str(attrs.get("camera", "orthographic"))
         if kind == "orthographic":
             return None
         if kind != "perspective":
             raise InputError(f"{self.path}: camera is {kind!r}, expected 'orthographic' or 'perspective'")
         if "focal_px" not in attrs or "principal_point" not in attrs:
             raise InputError(f"{self.path}: a perspective camera needs the attributes focal_px and principal_point")
-        return float(attrs["focal_px"]), np.asarray(attrs["principal_point"], float).reshape(2)
+        try:
+            return float(attrs["focal_px"]), np.asarray(attrs["principal_point"], float).reshape(2)
+        except (TypeError, ValueError) as e:
+            raise InputError(f"{self.path}: focal_px and principal_point are not numbers (1 and 2)") from e
 
 
 def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path | str | None = None) -> dict[str, Any]:
@@ -92,34 +90,34 @@ def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path |
     irradiance baseline of a blurred image is reported too. Angles in degrees, shares 0…1. Raises InputError if a file
     cannot be used or the two do not belong together. `measures` defines each figure.
     """
-    with _File(Path(truth_path), "truth") as truth:
-        size = truth.array("surface/valid", (None, None)).shape
-        surface = {
-            "valid": truth.array("surface/valid", size).astype(bool),
-            "normals": unit(truth.array("surface/normals", (*size, 3))),
-            "height": truth.array("surface/height", size).astype(float),
-        }
-        light = truth.array("irradiance/map", size).astype(float) if truth.has("irradiance/map") else None
-        elements = _true_instances(truth) if truth.has("instances") else None
-        true_camera = truth.camera()
+    truth = _File(Path(truth_path), "truth")
+    size = truth.array("surface/valid", (None, None)).shape
+    surface = {
+        "valid": truth.array("surface/valid", size).astype(bool),
+        "normals": unit(truth.array("surface/normals", (*size, 3))),
+        "height": truth.array("surface/height", size).astype(float),
+    }
+    light = truth.array("irradiance/map", size).astype(float) if truth.has("irradiance/map") else None
+    elements = _true_instances(truth) if truth.has("instances") else None
+    true_camera = truth.camera()
     result_path = Path(result_path)
     if result_path.is_dir():
         result_path /= "result.h5"
-    with _File(result_path, "result") as result:
-        own = result.array("surface/valid", (None, None)).shape
-        if own != size:
-            raise InputError(
-                f"{result_path} is {own[1]} × {own[0]} pixels, {truth_path} is {size[1]} × {size[0]}: "
-                "they do not belong to the same image"
-            )
-        valid = result.array("surface/valid", size).astype(bool)
-        normals = unit(result.array("surface/normals", (*size, 3)))
-        height = result.array("surface/height", size).astype(float)
-        estimate = result.array("irradiance/map", size).astype(float)
-        sigma = result.array("surface/normal_sigma", size).astype(float)
-        piece = result.array("surface/piece", size) if result.has("surface/piece") else np.zeros(size, np.int32)
-        instances = _accepted_instances(result)
-        camera = result.camera()
+    result = _File(result_path, "result")
+    own = result.array("surface/valid", (None, None)).shape
+    if own != size:
+        raise InputError(
+            f"{result_path} is {own[1]} × {own[0]} pixels, {truth_path} is {size[1]} × {size[0]}: "
+            "they do not belong to the same image"
+        )
+    valid = result.array("surface/valid", size).astype(bool)
+    normals = unit(result.array("surface/normals", (*size, 3)))
+    height = result.array("surface/height", size).astype(float)
+    estimate = result.array("irradiance/map", size).astype(float)
+    sigma = result.array("surface/normal_sigma", size).astype(float)
+    piece = result.array("surface/piece", size) if result.has("surface/piece") else np.zeros(size, np.int32)
+    instances = _accepted_instances(result)
+    camera = result.camera()
 
     turned = true_camera is not None and camera is None
     if turned:

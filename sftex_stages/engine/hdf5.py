@@ -14,6 +14,7 @@ from .stage import Arrays
 
 _CHUNKED_FROM = 4096  # bytes; below, a compressed chunk costs more than it saves
 _CHUNK_BYTES = 1 << 20
+_MOST_RATIO = 1100  # of numbers to stored bytes: deflate cannot do better than 1032
 
 
 def encode(arrays: Arrays) -> bytes:
@@ -33,11 +34,16 @@ def encode(arrays: Arrays) -> bytes:
 
 
 def decode(image: bytes) -> Arrays:
-    """The arrays of `encode`, read-only. Text comes back as '<U…', scalars as 0-d arrays."""
+    """The arrays of `encode`, read-only. Text comes back as '<U…', scalars as 0-d arrays.
+
+    ValueError for what `encode` does not write: data outside of the file, or more of it than the bytes can hold.
+    """
     arrays: Arrays = {}
 
     def visit(name: str, node: object) -> None:
         if isinstance(node, h5py.Dataset):
+            if problem := plain(node):
+                raise ValueError(f"{name} {problem}")
             text = h5py.check_string_dtype(node.dtype) is not None
             array = np.asarray(node.asstr()[()], dtype=np.str_) if text else np.asarray(node[()])
             array.flags.writeable = False  # shared between the jobs of a worker: no stage may change its inputs
@@ -46,6 +52,17 @@ def decode(image: bytes) -> Arrays:
     with h5py.File.in_memory(file_image=image) as file:
         file.visititems(visit)
     return arrays
+
+
+def plain(dataset: h5py.Dataset) -> str:
+    """What makes a dataset other than plain numbers or text in its own file, in words; "" if nothing does."""
+    if dataset.is_virtual or dataset.external:
+        return "is not an ordinary dataset: its numbers are in another file"
+    declared = (dataset.size or 0) * dataset.dtype.itemsize
+    stored = dataset.id.get_storage_size()
+    if declared > _CHUNKED_FROM and declared > _MOST_RATIO * stored:
+        return f"declares {declared / 2**30:.1f} GiB of data in {stored} bytes"
+    return ""
 
 
 def _utf8(array: np.ndarray) -> np.ndarray:

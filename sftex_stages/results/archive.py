@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from ..engine.stage import Arrays
 from ..errors import InputError
+from ..guarded import Declared, read_hdf5
 
 SCHEMA_NAME = "sftex-result"
 SCHEMA_VERSION = 1
@@ -183,26 +185,20 @@ def _create(file: h5py.File, name: str, array: np.ndarray, dtype: str) -> h5py.D
 def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
     """Read a result.h5 completely.
 
-    Nothing but plain datasets inside of this one file is read: links, external storage and virtual datasets are
-    refused, and so is, before any is read, data of more than `max_bytes`. Raises InputError.
+    It is read in a child process (see `guarded`), so that a hostile file can neither crash nor hang this one. Nothing
+    but plain datasets inside of this one file is read: links, external storage and virtual datasets are refused, and so
+    is, before any is read, data of more than `max_bytes`. Raises InputError.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the result.h5 in an output folder")
     try:
-        with h5py.File(path, "r", locking=False) as file:
-            attributes = {str(name): value for name, value in file.attrs.items()}
-            _check_schema(path, attributes)
-            datasets = {name: _dataset(path, file, name) for name in SCHEMA}
-            _check_shapes(path, datasets, max_bytes)
-            data = {n: _text(d) if SCHEMA[n].dtype == "U" else d[()] for n, d in datasets.items()}
-            for name in ("keys", "versions"):
-                attributes[name] = json.loads(attributes[name])
-            camera = str(attributes.pop("camera"))
-            focal = float(attributes.pop("focal_px")) if camera == "perspective" else None
-            centre = tuple(map(float, attributes.pop("principal_point"))) if camera == "perspective" else None
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as e:
-        raise InputError(f"{path}: not a whole sftex result ({e}); run sftex again to make it anew") from e
+        attributes, data = read_hdf5(path, list(SCHEMA), max_bytes, partial(_check, path), "result")
+        for name in ("keys", "versions"):
+            attributes[name] = json.loads(attributes[name])
+        camera = str(attributes.pop("camera"))
+        focal = float(attributes.pop("focal_px")) if camera == "perspective" else None
+        centre = tuple(map(float, attributes.pop("principal_point"))) if camera == "perspective" else None
+    except (KeyError, ValueError, TypeError, RecursionError) as e:
+        raise InputError(f"{path}: not a whole result file ({e}); run sftex again to make it anew") from e
     return Result(
         path=path,
         **{n: data[f"surface/{n}"] for n in ("height", "normals", "valid", "normal_sigma")},
@@ -216,7 +212,8 @@ def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
     )
 
 
-def _check_schema(path: Path, attributes: Mapping[str, Any]) -> None:
+def _check(path: Path, attributes: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
+    """InputError unless a file says of itself what `SCHEMA` says."""
     if attributes.get("schema") != SCHEMA_NAME:
         raise InputError(
             f"{path}: an HDF5 file, but not a result of sftex (its attribute schema is not “{SCHEMA_NAME}”)"
@@ -225,40 +222,15 @@ def _check_schema(path: Path, attributes: Mapping[str, Any]) -> None:
         raise InputError(
             f"{path}: written by a newer sftex (schema {version}, this one reads {SCHEMA_VERSION}); update it"
         )
-
-
-def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """The dataset `name`, which must lie in this file."""
-    node: Any = file
-    for part in name.split("/"):
-        link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
-        if link is None:
-            raise InputError(f"{path}: {name} is missing; run sftex again to make the file anew")
-        if not isinstance(link, h5py.HardLink):
-            raise InputError(f"{path}: {name} is a link to elsewhere; such files are not read")
-        node = node[part]
-    if not isinstance(node, h5py.Dataset) or node.is_virtual or node.external:
-        raise InputError(f"{path}: {name} is not an ordinary dataset of this file; such files are not read")
-    return node
-
-
-def _check_shapes(path: Path, datasets: Mapping[str, h5py.Dataset], max_bytes: int) -> None:
-    total = 0
     sizes: dict[str, int] = {}
-    for name, dataset in datasets.items():
-        entry = SCHEMA[name]
-        kinds = "SO" if entry.dtype == "U" else {"f4": "f", "i4": "iu", "?": "b"}[entry.dtype]
-        shape = dataset.shape or ()
-        if dataset.dtype.kind not in kinds or not _fits(entry, shape, sizes):
+    for name, entry in SCHEMA.items():
+        if name not in declared:
+            raise InputError(f"{path}: {name} is missing; run sftex again to make the file anew")
+        dtype, shape = declared[name]
+        kind = np.dtype(dtype).kind if dtype != "U" else "U"
+        if kind not in {"U": "U", "f4": "f", "i4": "iu", "?": "b"}[entry.dtype] or not _fits(entry, shape, sizes):
             known = ", ".join(f"{axis} = {sizes[axis]}" for axis in entry.axes.split() if axis in sizes)
-            expected = f"{entry.dtype} with axes {entry.axes} ({known})"
-            raise InputError(f"{path}: {name} is {dataset.dtype} {shape}, expected {expected}")
-        total += dataset.size * dataset.dtype.itemsize
-    if total > max_bytes:
-        raise InputError(
-            f"{path}: declares {total / 2**30:.1f} GiB of data, over the limit of {max_bytes / 2**30:.1f} GiB"
-        )
-
-
-def _text(dataset: h5py.Dataset) -> np.ndarray:
-    return np.asarray(dataset.asstr()[()], dtype=np.str_)
+            found = "text" if dtype == "U" else np.dtype(dtype).name
+            raise InputError(
+                f"{path}: {name} is {found} {shape}, expected {entry.dtype} with axes {entry.axes} ({known})"
+            )

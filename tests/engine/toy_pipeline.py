@@ -74,6 +74,8 @@ def part(inputs, params):
             os._exit(3)
         if params.trouble == "segv":
             os.kill(os.getpid(), signal.SIGSEGV)
+        if params.trouble == "kill":  # as the kernel does when memory runs out
+            os.kill(os.getpid(), signal.SIGKILL)
         if params.trouble == "mutate":
             inputs["read"]["x"][0] = 7
     # a big matrix product, which a multi-threaded BLAS would sum in another order

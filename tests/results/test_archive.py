@@ -150,7 +150,7 @@ def test_files_of_another_kind_are_refused(path: Path, tmp_path: Path) -> None:
     whole = path.read_bytes()
     for name, content in {"cut.h5": whole[: len(whole) // 2], "text.h5": b"no archive\n" * 50, "empty.h5": b""}.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=rf"{name}: not a whole sftex result .* run sftex again"):
+        with pytest.raises(InputError, match=rf"{name}: not a whole result file .* make or copy it anew"):
             archive.open_result(tmp_path / name)
     with h5py.File(tmp_path / "truth.h5", "w") as file:
         file.attrs["schema"] = "sftex-truth-1"
@@ -160,7 +160,7 @@ def test_files_of_another_kind_are_refused(path: Path, tmp_path: Path) -> None:
         file.attrs["schema_version"] = 99
     with pytest.raises(InputError, match="newer sftex"):
         archive.open_result(path)
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="no such result file"):
         archive.open_result(tmp_path / "gone.h5")
 
 
@@ -170,5 +170,5 @@ def test_flipped_bits_in_the_data_are_found(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[info.byte_offset + info.size // 2] ^= 0x10
     path.write_bytes(data)
-    with pytest.raises(InputError, match="not a whole sftex result"):
+    with pytest.raises(InputError, match="not a whole result file"):
         archive.open_result(path)
