@@ -113,7 +113,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     rgb, detect = inputs["image"]["rgb"], inputs["detect"]
     members = np.flatnonzero(inputs["cluster"]["label"] == int(inputs["part"]))
     if len(members) < 4:
-        # three views leave a second metric frame as a rule (the preserved directions of the two need not agree); a fourth decides
+        # three views leave a second metric frame as a rule, whose preserved directions differ; a fourth decides
         return empty(f"only {len(members)} instances; four are the least that fix one frontal view")
     xy0, frames0 = detect["xy"][members].astype(np.float64), detect["frame"][members].astype(np.float64)
 
