@@ -1,5 +1,5 @@
 # make reconstruct IMAGES=photos/ [OUT=outputs] [CONFIG=pipeline.yaml] [MASKS=dir/] [JOBS=2]
-# make test | bench [SCENES='sphere*'] [BENCH_OUT=dir/] | clean | help
+# make test | bench [SCENES='sphere*'] [BENCH_OUT=dir/] | faults (the long set; some 30 minutes) | clean | help
 # The first target that needs it creates .venv with the locked versions; only Python 3.11 (or newer) and make are needed.
 
 IMAGES    ?= data/examples
@@ -19,7 +19,7 @@ STAMP := $(VENV)/.ready
 # Values reach the recipes through the environment: names with spaces need no quoting there.
 export IMAGES OUT CONFIG MASKS JOBS SCENES BENCH_OUT
 
-.PHONY: reconstruct test lint bench setup clean help
+.PHONY: reconstruct test faults lint bench setup clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -40,6 +40,9 @@ reconstruct: $(STAMP)
 
 test: lint
 	@$(BIN)/python -m pytest
+
+faults: $(STAMP)
+	@SFTEX_FAULTS=long $(BIN)/python -m pytest tests/faults
 
 lint: $(STAMP)
 	@$(BIN)/ruff check sftex_stages tests

@@ -12,8 +12,8 @@ from pydantic import Field
 from sftex_stages.engine.execute import execute
 from sftex_stages.engine.plan import Delivery, Item, Planner
 from sftex_stages.engine.stage import Stage, StageParams
-from sftex_stages.engine.store import Store
-from sftex_stages.errors import StageError
+from sftex_stages.engine.store import Store, write_atomically
+from sftex_stages.errors import StageError, StoreError
 
 
 def _log(name):
@@ -99,8 +99,10 @@ STAGES = [
 
 def deliver(folder, arrays, meta):
     _log("deliver")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "sum.txt").write_text(f"{arrays['total']['sum']} {meta['title']}")
+    try:
+        write_atomically(folder / "sum.txt", f"{arrays['total']['sum']} {meta['title']}".encode(), folder)
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written ({error.strerror})") from error
     return [folder / "sum.txt"]
 
 

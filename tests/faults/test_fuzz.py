@@ -1,0 +1,174 @@
+"""Files from others, mutated: no crash, no hang, nothing outside. The process that matters is the one of the tests."""
+
+import os
+import time
+
+import h5py
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from faults import LONG
+
+from sftex_stages import evaluate, guarded, images, pipeline
+from sftex_stages.engine.execute import execute
+from sftex_stages.errors import InputError
+from sftex_stages.results import archive
+
+
+def mutations(content, rng, times):
+    """Random bytes, blocks, extreme numbers, cuts and splices."""
+    size = len(content)
+    for number in range(times):
+        data = bytearray(content)
+        kind = number % 6
+        where = rng.randrange(size if number % 2 else min(size, 3000))  # headers more often than data
+        if kind == 0:
+            for _ in range(rng.choice([1, 3, 10, 50])):
+                data[rng.randrange(size)] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            data[where : where + 8] = rng.choice([b"\xff" * 8, b"\0" * 8, b"\x7f" + b"\xff" * 7, b"\0" * 7 + b"\x80"])
+        elif kind == 2:
+            data[where : where + 64] = rng.randbytes(64)
+        elif kind == 3:
+            data = data[: rng.randrange(size)]
+        elif kind == 4:
+            other = rng.randrange(size)
+            data[where : where + 200] = data[other : other + 200]
+        else:
+            for _ in range(5):
+                at = rng.randrange(min(size, 2000))
+                data[at : at + 2] = rng.randbytes(2)
+        yield bytes(data)
+
+
+def result_files(folder):
+    """A result as sftex writes it, and one as plain h5py does (whose metadata have no checksums)."""
+    rng = np.random.default_rng(0)
+    data, sizes = {}, {"H": 40, "W": 50, "N": 9, "K": 2, "n": 6}
+    for name, entry in archive.SCHEMA.items():
+        shape = tuple(int(a) if a.isdigit() else sizes[a] for a in entry.axes.split())
+        data[name] = np.full(shape, "word", "S8") if entry.dtype == "U" else rng.random(shape).astype(entry.dtype)
+    for kind, options in {"sealed.h5": {"libver": ("v110", "v110")}, "plain.h5": {}}.items():
+        with h5py.File(folder / kind, "w", **options) as file:
+            file.attrs.update({"schema": archive.SCHEMA_NAME, "schema_version": 1, "camera": "orthographic"})
+            file.attrs.update({"keys": "{}", "versions": "{}"})
+            for name, array in data.items():
+                text = array.astype(h5py.string_dtype("utf-8", 8)) if array.dtype.kind == "S" else array
+                whole = {"compression": "gzip", "chunks": True, "fletcher32": True} if array.nbytes > 4000 else {}
+                file.create_dataset(name, data=text, **whole)
+        assert archive.open_result(folder / kind).height.shape == (40, 50)
+    return [(folder / kind).read_bytes() for kind in ("sealed.h5", "plain.h5")]
+
+
+def listing(*folders):
+    return {p: p.stat().st_mtime_ns for folder in folders for p in folder.rglob("*") if p.name != "fuzzed.h5"}
+
+
+def test_fuzzed_results(tmp_path, monkeypatch, rng, measured):
+    (tmp_path / "cwd").mkdir()
+    monkeypatch.chdir(tmp_path / "cwd")
+    seeds = result_files(tmp_path)
+    times = 250 if LONG else 20
+    before = listing(tmp_path)
+    path, counts, longest, children = tmp_path / "fuzzed.h5", {"read": 0, "refused": 0, "crashed": 0}, 0.0, set()
+    for seed in seeds:
+        for number, data in enumerate(mutations(seed, rng, times)):
+            path.write_bytes(data)
+            started = time.monotonic()
+            try:
+                archive.open_result(path) if number % 3 else evaluate.evaluate(tmp_path / "sealed.h5", path)
+                counts["read"] += 1
+            except InputError as error:
+                assert str(path) in str(error) or "sealed.h5" in str(error)
+                counts["crashed" if "reading it crashed" in str(error) else "refused"] += 1
+            longest = max(longest, time.monotonic() - started)
+            if guarded._child:
+                children.add(guarded._child.process.pid)
+    assert longest < 10 + (0 if LONG else 5) and listing(tmp_path) == before
+    words = f"{counts['refused']} refused, {counts['read']} read (damage in numbers without checksum), "
+    words += f"{counts['crashed']} ended the reading child; longest {longest:.1f} s; nothing written"
+    measured("fuzzed result and truth files", 2 * times, words)
+
+
+def image_seeds(folder):
+    pixels = np.random.default_rng(1).integers(0, 256, (40, 60, 4), np.uint8)
+    for ending, channels in {"png": 4, "jpg": 3, "tif": 3, "exr": 4, "bmp": 3, "webp": 3}.items():
+        path = folder / f"seed.{ending}"
+        spec = oiio.ImageSpec(60, 40, channels, "half" if ending == "exr" else "uint8")
+        file = oiio.ImageOutput.create(str(path))
+        assert file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels[..., :channels]))
+        file.close()
+        yield ending, path.read_bytes()
+        path.unlink()
+
+
+def test_fuzzed_images(tmp_path, monkeypatch, rng, measured):
+    """Through the engine, as a user's files go: a decoder that crashes takes its worker, not the run."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    monkeypatch.chdir(tmp_path)
+    seeds = list(image_seeds(tmp_path))
+    times = 204 if LONG else 12
+    for ending, seed in seeds:
+        for number, data in enumerate(mutations(seed, rng, times // len(seeds))):
+            (folder / f"{ending}{number}.{ending}").write_bytes(data)
+    items = pipeline.items(images.discover(folder))
+    assert len(items) == times
+
+    class Clock:
+        def __init__(self):
+            self.last, self.longest = time.monotonic(), 0.0
+
+        def progress(self, result, stage, done, jobs):
+            self.finished(result)
+
+        def finished(self, result):
+            now = time.monotonic()
+            self.longest, self.last = max(self.longest, now - self.last), now
+
+    clock = Clock()
+    params = {stage.name: stage.params() for stage in pipeline.PIPELINE}
+    planner = pipeline.planner(tmp_path / "out", params, until="image")
+    results = execute(planner, items, 2, clock)
+    failed = [result.error for result in results if result.error]
+    crashed = sum("died" in error for error in failed)
+    assert not any("unexpected" in error for error in failed), [e for e in failed if "unexpected" in e]
+    assert all(
+        str(result.item.files["image"]) in result.error or "died" in result.error for result in results if result.error
+    )
+    assert clock.longest < 10
+    assert {p.name for p in tmp_path.iterdir()} == {"in", "out"} and len(os.listdir(folder)) == times
+    words = (
+        f"{len(failed) - crashed} refused with a reason, {times - len(failed)} decoded, {crashed} ended their worker; "
+    )
+    measured("fuzzed images (PNG, JPEG, TIFF, EXR, BMP, WebP)", times, words + f"longest wait {clock.longest:.1f} s")
+
+
+@pytest.mark.parametrize("fault", [11, 9])
+def test_a_reader_that_crashes_is_an_error_and_the_next_file_is_read(tmp_path, fault):
+    result_files(tmp_path)
+    archive.open_result(tmp_path / "plain.h5")
+    child = guarded._child
+    real = child.to.write
+
+    def write(data):
+        os.kill(child.process.pid, fault)
+        child.process.wait()
+        return real(data)
+
+    child.to = type("To", (), {"write": staticmethod(write), "flush": child.to.flush})()
+    with pytest.raises(InputError, match=r"plain\.h5: .*crashed, SIG(SEGV|KILL)"):
+        archive.open_result(tmp_path / "plain.h5")
+    assert archive.open_result(tmp_path / "plain.h5").valid.shape == (40, 50)
+
+
+def test_a_reader_that_hangs_is_stopped(tmp_path, monkeypatch):
+    result_files(tmp_path)
+    child = guarded._child
+    monkeypatch.setattr(guarded, "PATIENCE", 0.3)
+    monkeypatch.setattr(guarded._Child._json, "__defaults__", (0.3,))
+    monkeypatch.setattr(guarded._Child._bytes, "__defaults__", (0.3,))
+    os.kill(child.process.pid, 19)  # SIGSTOP
+    with pytest.raises(InputError, match=r"no answer within 0 s"):
+        archive.open_result(tmp_path / "plain.h5")
+    assert child.process.returncode is not None
