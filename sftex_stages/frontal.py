@@ -15,7 +15,6 @@ from .geometry.metric import (
     constraint_gap,
     leading_bias,
     metric_covariance,
-    metric_upgrade,
     noise_split,
     project_tensors,
     turn_variance,
@@ -24,13 +23,13 @@ from .geometry.registration import patch_grid, register, sample
 from .geometry.texton import (
     Estimate,
     Settings,
-    circle_of,
     estimate_texton,
     independent_samples,
     information_centre,
     posterior,
     strain_covariance,
     tensor_covariance,
+    upgrade_texton,
     weighted_contrast,
     weighted_mean,
     with_tensor,
@@ -44,7 +43,7 @@ class Params(StageParams):
     """Parameters of `frontal`."""
 
     radius: float = Field(4.5, gt=1, le=20, description="radius of the first domain, in sizes (σ) of the interest point")
-    region_radius: float = Field(1.6, gt=1, le=5, description="radius of the first domain, in radii of the region")
+    region_radius: float = Field(2.0, gt=1, le=5, description="radius of the first domain, in radii of the region")
     min_radius: float = Field(6.0, ge=0, le=50, description="least radius of the first domain, px of the image")
     max_growth: float = Field(2.2, ge=1, le=5, description="the domain may grow to this multiple of the first radius")
     iterations: int = Field(20, ge=5, le=100, description="EM iterations")
@@ -117,15 +116,15 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
         return empty(f"only {len(members)} instances; four are the least that fix one frontal view")
     xy0, frames0 = detect["xy"][members].astype(np.float64), detect["frame"][members].astype(np.float64)
 
-    # one grid point is about one pixel of the pyramid level on which the first domain is 8 to 13 points in radius
+    # one grid point is about one pixel of the pyramid level on which the first domain is 8 to 15 points in radius
     radius = params.region_radius if detect["kind"][members[0]] else params.radius
     unit = float(np.median(np.sqrt(np.abs(np.linalg.det(frames0)))))
     radius = max(radius, params.min_radius / unit)
     size = unit * radius
-    level = int(np.clip(np.ceil(np.log2(size / 13.0)), -1, 5))
+    level = int(np.clip(np.ceil(np.log2(size / 15.0)), -1, 5))
     image = level_image(rgb, level)
     factor = 2.0**-level
-    half = int(np.clip(round(size * factor), 6, 13))
+    half = int(np.clip(round(size * factor), 6, 15))
     xy = (xy0 + 0.5) * factor - 0.5
     frames = frames0 * (radius * factor / half)
     extent = np.array([rgb.shape[1], rgb.shape[0]], float)
@@ -182,8 +181,7 @@ def finish(
     if inlier.sum() < 2.5:
         return empty("its patches do not agree with their mean")
     order = params.trend_order if inlier.sum() >= 12 else 0
-    circle = circle_of(template)
-    upgrade = metric_upgrade(got.frames, where, inlier + 1e-6, order, circle=circle)
+    upgrade, circular = upgrade_texton(template, got.frames, where, inlier + 1e-6, order)
     frames_ = got.frames @ np.linalg.cholesky(upgrade.gram)
     scale = np.exp(upgrade.log_scale)
     tensor = tensor_of(frames_, scale)
@@ -191,7 +189,7 @@ def finish(
     gap, spread = constraint_gap(tensor, own)
     inflation, scale_var = noise_split(gap, spread, inlier)
     turn = turn_variance(tensor, own * inflation)
-    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, turn, circle is not None)
+    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, turn, circular)
     common = common_covariance(frames_, where, scale, order, metric_cov)
     cov = own * inflation + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
     projected, left, chi2 = project_tensors(tensor, cov)
@@ -209,7 +207,7 @@ def finish(
     typical = float(np.median(sigma[good])) if good.any() else np.inf
     if good.sum() < 4:
         reason = f"only {int(good.sum())} instances agree with it"
-    elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circle is not None else 1.0):
+    elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circular else 1.0):
         reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
     elif metric_error > params.max_metric_error:
         reason = f"its instances keep one direction of the element and do not fix its stretch (error {metric_error:.2f})"
@@ -225,7 +223,7 @@ def finish(
         "progress_iterations": np.array([h[0] for h in texton.history], np.int32),
         "metric_residual": np.array(upgrade.residual, np.float32),
         "information": np.array(metric_error, np.float32),
-        "circular": np.array(circle is not None),
+        "circular": np.array(circular),
         "index": members.astype(np.int32),
         "xy": ((centre + 0.5) / factor - 0.5).astype(np.float32),
         "transform": transform.astype(np.float32),

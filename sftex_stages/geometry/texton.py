@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .imaging import tensor_of
-from .metric import circle_metric, gram_lift, leading_eigenpair, metric_upgrade, project_tensors
+from .metric import Upgrade, circle_metric, gram_lift, leading_eigenpair, metric_upgrade, project_tensors
 from .registration import Template, compose_step, make_template, marginal_hessian, patch_grid, registration_step, sample
 
 Array = NDArray[np.floating]
@@ -174,9 +174,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             since = iteration - settings.affine_iterations
             if since % _UPGRADE_EVERY == 0:
                 order = settings.trend_order if len(xy) >= 12 else 0
-                upgrade = metric_upgrade(
-                    frames, where, inlier + 1e-6, order, 30 if since == 0 else 5, since > 0, circle_of(template)
-                )
+                upgrade, _ = upgrade_texton(template, frames, where, inlier + 1e-6, order, 30 if since == 0 else 5, since > 0)
                 frames, scale = frames @ np.linalg.cholesky(upgrade.gram), np.exp(upgrade.log_scale)
             frames = hold_to_manifold(frames, scale, template, residual)
             # the normal that an element tells is the one where its detail lies, not where the detector put its point
@@ -210,15 +208,32 @@ _DAMPING = 1e-3
 _UPGRADE_EVERY = 3  # iterations on the manifold between metric upgrades
 _SETTLED = 3e-3  # strain of a step that moves no edge of an element by a twentieth of a pixel
 _HALF = 15  # a domain of more grid points is sampled more coarsely: large elements have large detail
-_CIRCLE = 0.03  # a turn that costs less than this share of the next strain is none
+_CIRCLE = 0.15  # a turn that costs less than this share of the next strain is none
+_ROUND = 1.2  # a circle may fit this much worse than a free stretch, which has two numbers more
 
 
 def circle_of(template: Template) -> Array | None:
-    """M (2, 2) up to size for a circular element (section 2.2.2), None for any other."""
+    """M (2, 2) up to size of an element that a turn leaves alone (section 2.2.2), None for any other."""
     ratio, gram = circle_metric(marginal_strain(template))
     if gram is None or ratio > _CIRCLE or np.linalg.cond(gram) > 6:
         return None  # a long ellipse is an edge or a line rather than a tilted disc
     return gram
+
+
+def upgrade_texton(
+    template: Template, frames: Array, where: Array, weights: Array, order: int, steps: int = 30, warm: bool = False
+) -> tuple[Upgrade, bool]:
+    """The metric upgrade of a texton's frames, and whether its element was taken for a circle (section 2.2.2).
+
+    An element that a turn leaves alone is set to a circle where equal major axes fit its instances about as well as a
+    free stretch does: a dot whose neighbours show, or a leaf that happens to be round, keeps its own.
+    """
+    upgrade = metric_upgrade(frames, where, weights, order, steps, warm)
+    gram = circle_of(template)
+    if gram is None:
+        return upgrade, False
+    round_ = metric_upgrade(frames, where, weights, order, steps, warm, gram)
+    return (round_, True) if round_.residual < _ROUND * upgrade.residual else (upgrade, False)
 
 
 def marginal_strain(template: Template) -> Array:
