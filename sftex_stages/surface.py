@@ -7,13 +7,33 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial import cKDTree
 
 from sftex_stages.engine.stage import Arrays, Stage, StageParams
 from sftex_stages.errors import StageError
-from sftex_stages.geometry import calibration, gaussian, pooling, refine, shading, sign_search, spline, support, tensors
+from sftex_stages.geometry import (
+    calibration,
+    gaussian,
+    perspective,
+    pooling,
+    refine,
+    shading,
+    sign_search,
+    spline,
+    support,
+    tensors,
+)
 from sftex_stages.geometry import field as irradiance_field
 
 Float = NDArray[np.floating]
+
+LIGHT_ABOVE, BULGE = 3.0, 0.5  # nats of what is usual, when nothing measured tells
+
+
+class Pinhole(StageParams):
+    """A known pinhole camera; its axis meets the centre of the image."""
+
+    focal_px: float = Field(gt=0, description="Focal length, in pixels of this image")
 
 
 class Params(StageParams):
@@ -21,6 +41,10 @@ class Params(StageParams):
 
     method: Literal["collapsed", "em"] = Field(
         "collapsed", description="Signs by the search with the surface integrated out, or by the paper's EM"
+    )
+    camera: Literal["auto", "orthographic"] | Pinhole = Field(
+        "auto",
+        description="`auto` believes in perspective where element sizes prove it; `{focal_px: 2200}` if it is known",
     )
     min_inlier: float = Field(
         0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)"
@@ -42,6 +66,7 @@ class Instances:
     texton: NDArray[np.integer]  # 0 … K − 1, used textons only
     calibration: calibration.Calibration
     covariance: Float  # of w, (N, 2, 2)
+    log_scale: Float  # (N,) of the calibrated transforms, up to a constant a texton
 
 
 def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
@@ -53,6 +78,7 @@ def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
         without a usable texton, or with fewer than three instances to believe in.
     """
     names = ["xy", "transform", "tensor", "tensor_cov", "normal", "inlier", "irradiance", "irradiance_sigma"]
+    names.append("log_scale_sigma")
     parts = [(k, f) for k, f in enumerate(frontal) if bool(f["usable"]) and len(f["xy"])]
     if not parts:
         raise StageError(
@@ -71,17 +97,19 @@ def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
     return rows
 
 
-def prepare(rows: Arrays, params: Params) -> Instances:
-    """Calibrate the textons against one another (`calibration.py`)."""
+def prepare(rows: Arrays, params: Params, camera: perspective.Camera | None = None) -> Instances:
+    """Calibrate the textons against one another (`calibration.py`), as the rays of `camera` see them."""
     xy = rows["xy"].astype(float)
     trust = np.where(rows["inlier"] > params.min_inlier, rows["inlier"], 0.0).astype(float)
     _, texton = np.unique(rows["texton"], return_inverse=True)
     _, covariance = tensors.deviator(rows["tensor"].astype(float), rows["tensor_cov"].astype(float))
-    result = calibration.calibrate(
-        xy, rows["transform"].astype(float), covariance, texton, np.maximum(trust, 1e-6), params.model_error
-    )
+    transform = rows["transform"].astype(float)
+    if camera is not None:
+        transform = camera.flatten(xy) @ transform
+    result = calibration.calibrate(xy, transform, covariance, texton, np.maximum(trust, 1e-6), params.model_error)
     spread = covariance * result.noise[texton][:, None, None] + (params.model_error**2 / 2) * np.eye(2)
-    return Instances(rows, xy, trust, texton.astype(np.int64), result, spread)
+    log_scale = np.log(calibration.scales(transform, result.e[texton]))
+    return Instances(rows, xy, trust, texton.astype(np.int64), result, spread, log_scale)
 
 
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
@@ -89,11 +117,13 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
 
     Returns
     -------
-    height (H, W) px toward the camera, mean 0; normals (H, W, 3) ∝ (−p, −q, 1); valid (H, W) bool; normal_sigma (H, W)
-    degrees, the root mean square angle expected; all NaN where not valid.
+    height (H, W) px toward the camera, mean 0 (perspective: px as they are at the distance f); normals (H, W, 3) in the
+    camera's frame; valid (H, W) bool; normal_sigma (H, W) degrees, the root mean square angle expected; NaN where not valid.
     instance/… (N, …), members of usable textons: xy, transform, inlier, irradiance, irradiance_sigma as delivered; normal
     calibrated, its sign resolved; normal_sigma of the surface there; texton; state, posteriors of {as delivered, the other
     sign, not from the surface}; sign_margin, nats by which the energy rises if the patch around flips (NaN: not used).
+    camera "orthographic" or "perspective", with focal_px (inf if orthographic) and principal_point (x, y); vote/…, nats by
+    which scale, light and bulge prefer this surface to its mirror image (`sign_votes`).
     energy, −log evidence of the surface; candidate/… and light: see `record`.
 
     Raises
@@ -102,30 +132,94 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
         without a usable texton, or with fewer than three instances to believe in.
     """
     mask = np.asarray(inputs["image"]["mask"], bool)
-    instances = prepare(collect(inputs["frontal"], params.min_inlier), params)
+    rows = collect(inputs["frontal"], params.min_inlier)
+    instances = prepare(rows, params)
     used = instances.trust > 0
     box = instances.xy[used].min(0), instances.xy[used].max(0)
     area = float(np.prod(np.maximum(box[1] - box[0], 1.0)))
     spacing = float(np.sqrt(area / min(used.sum(), params.nodes)))
-    robust = instances.trust * np.minimum(instances.calibration.weight, 1)
-    nodes = pooling.pool(
-        instances.xy, instances.calibration.w, instances.covariance, robust, spacing, params.model_error
-    )
+    nodes = pool(instances, spacing, params)
     low, high = box[0] - 2 * spacing, box[1] + 2 * spacing
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
     data = search_data(instances, nodes, spacing, params)
     find = sign_search.search if params.method == "collapsed" else sign_search.by_em
     candidates = find(data, coarse, spacing, params.finalists)
     best = candidates[0]
-    fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy)
     start = gaussian.gradients(coarse, best.a)
-    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth)
-    mirror = mirrored(nodes.xy, solution, best)
-    if mirror:
-        solution = refine.flipped(solution)
-    results = outputs(mask, instances, solution, fine, spacing)
     margin = np.append(sign_search.margins(data, coarse, best), np.nan)[nodes.member]
-    return results | {"instance/sign_margin": margin.astype(np.float32)} | record(candidates, mirror)
+    choice = choose_camera(instances, nodes, coarse.grid, start, best.smooth, spacing, mask.shape, params)
+    camera, height = choice.camera, None
+    if camera.bend:
+        before = cKDTree(nodes.xy)
+        instances = prepare(rows, params, camera)
+        nodes = pool(instances, spacing, params)
+        sizes = element_sizes(instances, nodes, spacing)
+        change = np.log(camera.rays(nodes.xy)[1])
+        height = sizes.heights(camera, nodes.xy, nodes.w, change) if sizes else None
+        start = start[before.query(nodes.xy)[1]]
+    votes = sign_votes(nodes.xy, start, best, choice)
+    sign = 1.0 if sum(votes.values()) >= 0 else -1.0
+    fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy, camera.stretch(nodes.xy))
+    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, sign * start, best.smooth, height=height)
+    results = outputs(mask, instances, solution, fine, spacing, camera)
+    results["instance/sign_margin"] = margin.astype(np.float32)
+    return results | record(candidates, sign < 0) | {f"vote/{k}": np.array(sign * v) for k, v in votes.items()}
+
+
+def pool(instances: Instances, spacing: float, params: Params) -> pooling.Nodes:
+    """Nodes of cells of `spacing` px."""
+    robust = instances.trust * np.minimum(instances.calibration.weight, 1)
+    return pooling.pool(
+        instances.xy, instances.calibration.w, instances.covariance, robust, spacing, params.model_error
+    )
+
+
+def choose_camera(
+    instances: Instances,
+    nodes: pooling.Nodes,
+    grid: spline.Grid,
+    start: Float,
+    smooth: gaussian.Smoothness,
+    spacing: float,
+    shape: tuple[int, int],
+    params: Params,
+) -> perspective.Choice:
+    """The camera that is asked for, or told by element sizes, and what these say about the sign of `start` (M, 2)."""
+    centre = ((shape[1] - 1) / 2, (shape[0] - 1) / 2)
+    bend = 1 / params.camera.focal_px if isinstance(params.camera, Pinhole) else None
+    sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
+    if sizes is None:
+        return perspective.Choice(perspective.Camera(centre, bend or 0.0), 0.0, 0.0)
+    size = float(max(shape))
+    return perspective.choose(grid, nodes.xy, nodes.w, nodes.covariance, sizes, start, smooth, centre, size, bend)
+
+
+def element_sizes(instances: Instances, nodes: pooling.Nodes, spacing: float) -> perspective.Sizes | None:
+    """Log scale of the elements on one scale for all textons; None with too few of them."""
+    sigma = np.hypot(instances.table["log_scale_sigma"].astype(float), 0.01)
+    used = (instances.trust > 0) & np.isfinite(sigma) & np.isfinite(instances.log_scale)
+    if used.sum() <= 30:
+        return None
+    value, variance = on_one_scale(instances, nodes, instances.log_scale, sigma, used, spacing)
+    return perspective.Sizes(value, variance, nodes.weight)
+
+
+def on_one_scale(
+    instances: Instances, nodes: pooling.Nodes, log: Float, sigma: Float, used: NDArray[np.bool_], spacing: float
+) -> tuple[Float, Float]:
+    """Means (M,) over the nodes of logarithms (N,) that every texton knows up to its own constant, and their variance."""
+    trust = np.where(used, instances.trust, 0.0)
+    present, texton = np.unique(instances.texton[used], return_inverse=True)
+    found = irradiance_field.fit(instances.xy[used], log[used], sigma[used], texton, trust[used], spacing, 1.0)
+    offset = np.zeros(instances.texton.max() + 1)
+    offset[present] = found.offset
+    return pooling.average(
+        np.where(used, log, 0.0) - offset[instances.texton],
+        np.where(used, sigma, 1.0) ** 2,
+        nodes,
+        np.maximum(trust, 1e-9),
+        0.01,
+    )
 
 
 def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, params: Params) -> sign_search.Data:
@@ -136,26 +230,27 @@ def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, para
     lit = (instances.trust > 0) & (light > 0) & np.isfinite(light)
     cue = None
     if params.shading and lit.sum() > 30:
-        log_l, trust = np.log(np.where(lit, light, 1.0)), np.where(lit, instances.trust, 0.0)
         sigma = np.hypot(instances.table["irradiance_sigma"].astype(float), 0.01)
-        present, texton = np.unique(instances.texton[lit], return_inverse=True)
-        found = irradiance_field.fit(instances.xy[lit], log_l[lit], sigma[lit], texton, trust[lit], spacing, 1.0)
-        offset = np.zeros(instances.texton.max() + 1)
-        offset[present] = found.offset
-        value, variance = pooling.average(
-            log_l - offset[instances.texton], sigma**2, nodes, np.maximum(trust, 1e-9), 0.01
-        )
+        value, variance = on_one_scale(instances, nodes, np.log(np.where(lit, light, 1.0)), sigma, lit, spacing)
         e = np.exp(value)
         e, variance = e / e.mean(), variance * (e / e.mean()) ** 2
         cue = shading.make_shading(nodes.xy, e, variance, tensors.normals(d))
     return sign_search.Data(nodes.xy, d, covariance, nodes.weight, log_outlier, cue)
 
 
-def mirrored(xy: Float, solution: refine.Solution, best: sign_search.Candidate) -> bool:
-    """Whether the mirror image is the more likely: light comes from above; without shading, a bulge rather than a bowl."""
+def sign_votes(xy: Float, g: Float, best: sign_search.Candidate, choice: perspective.Choice) -> dict[str, float]:
+    """Nats by which each cue prefers the surface of gradients `g` (N, 2) to its mirror image.
+
+    Smoothness and shading hold for both alike; what remains is a habit of the world: light comes from above, and things
+    bulge toward the camera. Element size measures it.
+    """
+    votes = {"scale": choice.sign, "light": 0.0, "bulge": 0.0}
     if best.light is not None and best.shade > 10:
-        return bool(best.light.direction[3] > 0)
-    return bool((solution.weight[:, None] * (xy - np.average(xy, axis=0)) * solution.gradient).sum() > 0)
+        c = best.light.direction[2:]
+        votes["light"] = float(-LIGHT_ABOVE * c[1] / max(np.hypot(*c), 1e-12))
+    out = float(((xy - xy.mean(0)) * g).sum())
+    votes["bulge"] = -BULGE * float(np.sign(out))
+    return votes
 
 
 def outputs(
@@ -164,21 +259,24 @@ def outputs(
     solution: refine.Solution,
     field: gaussian.Field,
     spacing: float,
+    camera: perspective.Camera,
 ) -> Arrays:
     """Dense maps and instances."""
     table = instances.table
     index, p = spline.stencil(field.grid, instances.xy, 1, 0)
     stencil = np.stack((p, spline.stencil(field.grid, instances.xy, 0, 1)[1]), 1)
+    stencil = camera.stretch(instances.xy) @ stencil
     g = np.einsum("npk,nk->np", stencil, solution.a[index])
-    spread = support.EXCESS * support.covariance_at(field.grid, solution.factor, instances.xy)
+    spread = support.EXCESS * support.covariance_at(field.grid, solution.factor, instances.xy, camera)
     spread += tensors.common_error(g, instances.calibration.common)
     state = posterior_states(instances, g, spread)
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
     common = instances.calibration.common
-    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing, common)
+    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing, common, camera)
     valid = maps["supported"] & mask
     nan = np.float32(np.nan)
-    height = maps["height"] - (maps["height"][valid].mean() if valid.any() else 0.0)
+    mean = maps["height"][valid].mean() if valid.any() else 0.0
+    height = (maps["height"] - mean) / (1 - mean * camera.bend)  # under perspective a change of the unit, as it must be
     return {
         "height": np.where(valid, height, nan).astype(np.float32),
         "normals": np.where(valid[..., None], maps["normals"], nan).astype(np.float32),
@@ -186,14 +284,16 @@ def outputs(
         "normal_sigma": np.where(valid, maps["sigma"], nan).astype(np.float32),
         "instance/xy": table["xy"].astype(np.float32),
         "instance/transform": table["transform"].astype(np.float32),
-        "instance/normal": resolve(instances, g).astype(np.float32),
+        "instance/normal": camera.turn(instances.xy, resolve(instances, g)).astype(np.float32),
         "instance/normal_sigma": np.degrees(tensors.angular_error(g, spread)).astype(np.float32),
         "instance/inlier": table["inlier"].astype(np.float32),
         "instance/irradiance": table["irradiance"].astype(np.float32),
         "instance/irradiance_sigma": table["irradiance_sigma"].astype(np.float32),
         "instance/texton": table["texton"],
         "instance/state": state.astype(np.float32),
-        "camera": np.array("orthographic"),
+        "camera": np.array("perspective" if camera.bend else "orthographic"),
+        "focal_px": np.array(1 / camera.bend if camera.bend else np.inf),
+        "principal_point": np.array(camera.centre),
         "energy": np.array(-solution.evidence),
     }
 
@@ -230,4 +330,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=1, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=2, params=Params, run=run, inputs=("image", "frontal"))

@@ -4,7 +4,7 @@ from synthetic_instances import instances_of, jittered
 
 from sftex_stages import surface
 from sftex_stages.errors import StageError
-from sftex_stages.geometry import tensors
+from sftex_stages.geometry import perspective, tensors
 
 SHAPE = (300, 360)
 
@@ -146,3 +146,48 @@ def test_very_few_instances_still_give_a_surface(count):
     xy = jittered(SHAPE, 60)[:count]
     out = surface.run({"image": image(), "frontal": instances_of((xy, bumps(xy)), textons=1)}, surface.Params())
     assert np.isfinite(out["energy"]) and out["valid"].shape == SHAPE
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    """Frontal results of a sheet under perspective, focal length 500 px, with the sign of its slopes relative to the rays."""
+    camera = perspective.Camera(((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), 1 / 500)
+    xy = jittered(SHAPE, 14)
+    h = 40 * np.sin(xy[:, 0] / 50) + 35 * np.cos(xy[:, 1] / 45) + 0.3 * xy[:, 1]
+    slope = np.stack((0.8 * np.cos(xy[:, 0] / 50), 0.3 - 7 / 9 * np.sin(xy[:, 1] / 45)), 1)
+    parts = instances_of((xy, camera.slopes(xy, slope)), noise=0.008)
+    flatten, cosine = camera.flatten(xy), camera.rays(xy)[1]
+    for k, part in enumerate(parts):
+        m = np.arange(len(xy)) % len(parts) == k
+        size = np.exp(h[m] / 500) / cosine[m]
+        part["transform"] = (size[:, None, None] * np.linalg.inv(flatten[m]) @ part["transform"]).astype(np.float32)
+        s = part["transform"] @ np.swapaxes(part["transform"], 1, 2)
+        s /= np.linalg.eigvalsh(s)[:, 1][:, None, None]
+        part["tensor"] = np.stack((s[:, 0, 0], s[:, 0, 1], s[:, 1, 1]), 1).astype(np.float32)
+    return camera, xy, slope, parts
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_element_sizes_give_focal_length_sign_and_normals_in_the_cameras_frame(sheet, given):
+    camera, xy, slope, parts = sheet
+    chosen = {"focal_px": 500.0} if given else "auto"
+    out = surface.run({"image": image(), "frontal": parts}, surface.Params(camera=chosen))
+    assert str(out["camera"]) == "perspective"
+    assert float(out["focal_px"]) == pytest.approx(500, rel=1e-9 if given else 0.1)
+    assert tuple(out["principal_point"]) == camera.centre
+    assert float(out["vote/scale"]) > 50
+    at = np.rint(xy).astype(int)
+    inside = out["valid"][at[:, 1], at[:, 0]]
+    truth = camera.turn(xy, tensors.normals(camera.slopes(xy, slope)))
+    found = out["normals"][at[:, 1], at[:, 0]][inside]
+    assert np.median(np.degrees(np.arccos(np.clip((found * truth[inside]).sum(1), -1, 1)))) < 2
+    inner = np.concatenate(
+        [np.flatnonzero(np.arange(len(xy)) % 3 == k) for k in range(3)]
+    )  # as the instances are stored
+    alike = (out["instance/normal"] * truth[inner]).sum(1)
+    assert np.degrees(np.arccos(np.clip(np.median(alike), -1, 1))) < 3
+
+
+def test_orthography_can_be_asked_for(sheet):
+    out = surface.run({"image": image(), "frontal": sheet[3]}, surface.Params(camera="orthographic"))
+    assert str(out["camera"]) == "orthographic" and np.isinf(out["focal_px"]) and out["vote/scale"] == 0

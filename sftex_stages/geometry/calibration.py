@@ -55,6 +55,12 @@ def shear_effect(transform: Float) -> tuple[Float, Float]:
     return w, jacobian
 
 
+def scales(transform: Float, e: Float) -> Float:
+    """Largest singular values (N,) of transforms (N, 2, 2) corrected by shears `e` (N, 2)."""
+    shear = np.eye(2) + np.stack((e, np.stack((e[:, 1], -e[:, 0]), 1)), 1)
+    return np.asarray(np.linalg.svd(transform @ shear, compute_uv=False)[:, 0])
+
+
 def predict_from_neighbours(xy: Float, w: Float, weight: Float, near: Int) -> tuple[Float, Float]:
     """Local linear prediction of w (N, 2) from neighbours `near` (N, k) with weights (N, k), and its variance (N,) if
     weights are inverse variances."""

@@ -5,7 +5,8 @@ Data speak about the gradient g_i = grad h(x_i) through `½ g_iᵀ W_i g_i − v
 design, the posterior precision is `A = Bᵀ W B + P`, the mean `A⁻¹ Bᵀ v`, and the field is integrated out in closed form.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -71,13 +72,17 @@ class Field:
     logdets: dict[Smoothness, float] = field(default_factory=dict, compare=False)  # of priors, as they are asked for
 
 
-def make_field(grid: spline.Grid, xy: Float) -> Field:
-    """The field of that grid with points `xy` (N, 2) px."""
+def make_field(grid: spline.Grid, xy: Float, stretch: Float | None = None) -> Field:
+    """The field of that grid with points `xy` (N, 2) px, its gradients times `stretch` (N, 2, 2) (`perspective.py`)."""
     index, p = spline.stencil(grid, xy, 1, 0)
     stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
+    if stretch is not None:
+        stencil = stretch @ stencil
+    rows = np.arange(0, 2 * index.size + 1, 16)
+    design = sp.csr_matrix((stencil.ravel(), np.repeat(index, 2, 0).ravel(), rows), shape=(2 * len(index), grid.size))
     add = scatter(grid, index)
     energies = tuple(add.pack(spline.energy(grid, m)) for m in range(4))
-    return Field(grid, index, stencil, spline.stencil(grid, xy)[1], spline.gradient_design(grid, xy), add, energies)
+    return Field(grid, index, stencil, spline.stencil(grid, xy)[1], design, add, energies)
 
 
 def prior(f: Field, smooth: Smoothness) -> Float:
@@ -140,8 +145,61 @@ def without_own(g: Float, covariance: Float, weight: Float, pull: Float) -> tupl
     return np.einsum("nij,nj->ni", others, np.einsum("nij,nj->ni", inverse, g) - pull), others
 
 
-def log_evidence(f: Field, weight: Float, pull: Float, smooth: Smoothness) -> float:
-    """log of the integral of exp(−½ gᵀ W g + vᵀ g) over the prior of the field, in nats."""
-    factor = posterior(f, weight, prior(f, smooth))
+@dataclass(frozen=True)
+class Heights:
+    """Measured heights `value` (N,) px of precision `precision` (N,), off by `columns` (N, K) times unknown coefficients
+    with standard deviations `spread` (K,)."""
+
+    value: Float
+    precision: Float
+    columns: Float
+    spread: Float
+
+    def over(self, factor: float) -> "Heights":
+        """The same with that factor on the variance."""
+        return replace(self, precision=self.precision / factor)
+
+    @cached_property
+    def normal(self) -> tuple[Float, Float]:
+        """Precision (K, K) of the coefficients at known heights, and their right side (K,)."""
+        heavy = self.precision[:, None] * self.columns
+        return self.columns.T @ heavy + np.diag(1 / self.spread**2), heavy.T @ self.value
+
+    @cached_property
+    def constant(self) -> float:
+        """What is left of the log likelihood without its quadratic terms."""
+        p = self.precision[self.precision > 0]
+        own = np.log(p / (2 * np.pi)).sum() - self.precision @ self.value**2
+        return 0.5 * float(own) - float(np.log(self.spread).sum())
+
+    def unrelated(self) -> float:
+        """Log likelihood in nats if the surface is flat: the columns alone explain the values."""
+        normal, right = self.normal
+        return self.constant + 0.5 * float(right @ np.linalg.solve(normal, right) - np.linalg.slogdet(normal)[1])
+
+
+def solve(f: Field, factor: blocks.Factor, pull: Float, height: Heights | None) -> tuple[Float, float]:
+    """Mean coefficients (M,) under pulls (N, 2) and heights, whose precision `factor` has; and the log of the integral of
+    the data's exponential over the coefficients and over those of the heights' columns, without the prior's log det."""
     b = pulled(f, pull)
-    return 0.5 * (float(b @ blocks.solve(factor, b)) + prior_logdet(f, smooth) - factor.logdet)
+    if height is None:
+        a = blocks.solve(factor, b)
+        return a, 0.5 * (float(b @ a) - factor.logdet)
+    b = b + lifted(f, height.precision * height.value)
+    cross = np.stack([lifted(f, height.precision * c) for c in height.columns.T], 1)
+    solved = blocks.solve(factor, np.concatenate((b[:, None], cross), 1))
+    normal, right = height.normal
+    schur = normal - cross.T @ solved[:, 1:]
+    beta = np.linalg.solve(schur, right - cross.T @ solved[:, 0])
+    a = solved[:, 0] - solved[:, 1:] @ beta
+    quadratic = float(b @ a + right @ beta) - factor.logdet - float(np.linalg.slogdet(schur)[1])
+    return a, height.constant + 0.5 * quadratic
+
+
+def log_evidence(f: Field, weight: Float, pull: Float, smooth: Smoothness, height: Heights | None = None) -> float:
+    """log of the integral of exp(−½ gᵀ W g + vᵀ g) over the prior of the field, in nats.
+
+    With measured heights, of their normalised likelihood as well.
+    """
+    factor = posterior(f, weight, prior(f, smooth), None if height is None else height.precision)
+    return solve(f, factor, pull, height)[1] + 0.5 * prior_logdet(f, smooth)

@@ -17,6 +17,7 @@ Float = NDArray[np.floating]
 
 FREEDOM = 4.0  # of the Student distribution; two dimensions
 NOISE_FACTORS = (0.05, 50.0)
+HEIGHT_FACTORS = (0.1, 100.0)
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Solution:
     smooth: gaussian.Smoothness
     noise: float
     evidence: float
+    height_noise: float = 1.0
 
 
 def linearise(w: Float, omega: Float, g: Float) -> tuple[Float, Float, float]:
@@ -44,12 +46,17 @@ def linearise(w: Float, omega: Float, g: Float) -> tuple[Float, Float, float]:
 
 
 def step(
-    f: gaussian.Field, w: Float, omega: Float, g: Float, smooth: gaussian.Smoothness
+    f: gaussian.Field,
+    w: Float,
+    omega: Float,
+    g: Float,
+    smooth: gaussian.Smoothness,
+    height: gaussian.Heights | None = None,
 ) -> tuple[Float, blocks.Factor, Float, Float]:
     """One Gauss-Newton step: coefficients, factor, and the information and pull it was made with."""
     information, pull, _ = linearise(w, omega, g)
-    factor = gaussian.posterior(f, information, gaussian.prior(f, smooth))
-    return blocks.solve(factor, gaussian.pulled(f, pull)), factor, information, pull
+    factor = gaussian.posterior(f, information, gaussian.prior(f, smooth), None if height is None else height.precision)
+    return gaussian.solve(f, factor, pull, height)[0], factor, information, pull
 
 
 def student(w: Float, omega: Float, g: Float, spread: Float) -> tuple[Float, Float]:
@@ -69,6 +76,7 @@ def refine(
     start: Float,
     smooth: gaussian.Smoothness,
     rounds: int = 4,
+    height: gaussian.Heights | None = None,
 ) -> Solution:
     """The surface from tensors `w` (N, 2) with `covariance` (N, 2, 2), trusted by `trust` (N,) in 0…1.
 
@@ -78,30 +86,40 @@ def refine(
         gradients with their signs decided; only where it starts, the tensors decide the rest.
     rounds : int
         of: smoothness and noise by one pattern search step, two Gauss-Newton steps, new robust weights.
+    height
+        heights, their precisions up to one noise factor, if they are measured (element size under perspective).
     """
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
     x, pace = np.log([smooth.strength, smooth.reach, 1.0]), np.array([0.7, 0.7, 0.7])
+    if height is not None:
+        x, pace = np.append(x, np.log(2.0)), np.append(pace, 0.7)
+
+    def rise(x: Float) -> gaussian.Heights | None:
+        return None if height is None else height.over(float(np.exp(x[3])))
 
     def score(x: Float) -> float:
-        strength, reach, noise = map(float, np.exp(x))
+        strength, reach, noise = map(float, np.exp(x[:3]))
         if not gaussian.reasonable(f, strength, reach) or not NOISE_FACTORS[0] <= noise <= NOISE_FACTORS[1]:
             return -np.inf
+        if height is not None and not HEIGHT_FACTORS[0] <= np.exp(x[3]) <= HEIGHT_FACTORS[1]:
+            return -np.inf
         information, pull, constant = linearise(w, precision * (robust / noise)[:, None, None], g)
-        return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach))
+        return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach), rise(x))
 
     for _ in range(rounds):
         x, moved = climb(score, x, pace)
         pace = pace if moved else pace / 2
-        strength, reach, noise = map(float, np.exp(x))
+        strength, reach, noise = map(float, np.exp(x[:3]))
         smooth = gaussian.Smoothness(strength, reach)
         for _ in range(2):
-            a, factor, information, pull = step(f, w, precision * (robust / noise)[:, None, None], g, smooth)
+            omega = precision * (robust / noise)[:, None, None]
+            a, factor, information, pull = step(f, w, omega, g, smooth, rise(x))
             g = limit(gaussian.gradients(f, a))
         spread = gaussian.gradient_covariance(f, factor)
         mean, alone = gaussian.without_own(g, spread, information, pull)
         robust = trust * student(w, precision / noise, limit(mean), alone)[0]
-    return Solution(a, factor, g, spread, robust, smooth, noise, score(x))
+    return Solution(a, factor, g, spread, robust, smooth, noise, score(x), float(np.exp(x[3])) if len(x) > 3 else 1.0)
 
 
 def climb(score: Callable[[Float], float], x: Float, pace: Float) -> tuple[Float, bool]:

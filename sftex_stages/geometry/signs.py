@@ -33,11 +33,9 @@ class Coupling:
     log_det: float
 
 
-def coupling(
-    field: gaussian.Field, d: Float, weight: Float, smooth: gaussian.Smoothness, height: Float | None = None
-) -> Coupling:
-    """The coupling of gradients `d` (N, 2) with precisions `weight` (N, 2, 2), and of heights with precisions (N,)."""
-    factor = gaussian.posterior(field, weight, gaussian.prior(field, smooth), height)
+def coupling(field: gaussian.Field, d: Float, weight: Float, smooth: gaussian.Smoothness) -> Coupling:
+    """The coupling of gradients `d` (N, 2) with precisions `weight` (N, 2, 2)."""
+    factor = gaussian.posterior(field, weight, gaussian.prior(field, smooth))
     pull = np.einsum("nij,nj->ni", weight, d)
     variance = gaussian.gradient_covariance(field, factor)
     own = np.einsum("ni,nij,nj->n", pull, variance, pull)

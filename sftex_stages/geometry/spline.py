@@ -98,16 +98,6 @@ def design(grid: Grid, xy: Float, dx: int = 0, dy: int = 0) -> sp.csr_matrix:
     return sp.csr_matrix((value.ravel(), index.ravel(), rows), shape=(len(index), grid.size))
 
 
-def gradient_design(grid: Grid, xy: Float) -> sp.csr_matrix:
-    """Sparse (2N, M) matrix to the gradient (p, q) at `xy` (N, 2) px, rows interleaved: p_0, q_0, p_1, …"""
-    (index, p), (_, q) = stencil(grid, xy, 1, 0), stencil(grid, xy, 0, 1)
-    value = np.stack((p, q), 1)
-    index = np.repeat(index[:, None, :], 2, 1)
-    return sp.csr_matrix(
-        (value.ravel(), index.ravel(), np.arange(0, index.size + 1, 16)), shape=(2 * len(p), grid.size)
-    )
-
-
 def energy(grid: Grid, order: int) -> sp.csr_matrix:
     """`E_m`: aᵀ E a = integral over the grid of sum_j C(m, j) (d^m h / dx^j dy^(m-j))², exact. Sparse (M, M)."""
     node, weight = np.polynomial.legendre.leggauss(4)  # exact to degree 7; the integrands have degree 6

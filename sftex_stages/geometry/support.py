@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, spline, tensors
+from sftex_stages.geometry import blocks, gaussian, perspective, spline, tensors
 
 Float = NDArray[np.floating]
 
@@ -45,6 +45,7 @@ def dense(
     xy: Float,
     spacing: float,
     common: float,
+    camera: perspective.Camera = perspective.ORTHOGRAPHIC,
 ) -> dict[str, NDArray]:
     """Maps of an image of `shape` (H, W): `height` px, `normals` (H, W, 3), `sigma` degrees, `supported`.
 
@@ -53,11 +54,14 @@ def dense(
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
     g = np.stack([spline.evaluate(f.grid, a, columns, rows, *d) for d in ((1, 0), (0, 1))], -1)
+    pixels = np.stack(np.meshgrid(columns, rows), -1)
+    g = camera.slopes(pixels, g)
     pace = max(spacing / 3, 1.0)
     at_x, at_y = (np.linspace(0, n - 1, max(int(np.ceil((n - 1) / pace)) + 1, 2)) for n in (shape[1], shape[0]))
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
     slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
-    spread = EXCESS * covariance_at(f.grid, factor, points) + tensors.common_error(slope, common)
+    slope = camera.slopes(points, slope)
+    spread = EXCESS * covariance_at(f.grid, factor, points, camera) + tensors.common_error(slope, common)
     sigma = np.degrees(tensors.angular_error(slope, spread)).reshape(len(at_y), len(at_x))
     height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(f.grid, xy)
@@ -66,17 +70,20 @@ def dense(
     far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {
-        "height": spline.evaluate(f.grid, a, columns, rows),
-        "normals": tensors.normals(g),
+        "height": camera.height(pixels, spline.evaluate(f.grid, a, columns, rows)),
+        "normals": camera.turn(pixels, tensors.normals(g)),
         "sigma": sigma,
         "supported": (far <= 1) & (sigma <= WORST),
     }
 
 
-def covariance_at(grid: spline.Grid, factor: blocks.Factor, xy: Float) -> Float:
-    """Posterior covariance (N, 2, 2) of the gradient at any `xy` (N, 2) px."""
+def covariance_at(
+    grid: spline.Grid, factor: blocks.Factor, xy: Float, camera: perspective.Camera = perspective.ORTHOGRAPHIC
+) -> Float:
+    """Posterior covariance (N, 2, 2) of the slope relative to the ray at any `xy` (N, 2) px."""
     index, p = spline.stencil(grid, xy, 1, 0)
     stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
+    stencil = camera.stretch(xy) @ stencil
     return blocks.covariance(blocks.selected_inverse(factor), index, stencil, stencil)
 
 

@@ -35,8 +35,12 @@ class Entry(NamedTuple):
 
 
 SCHEMA = {
-    "surface/height": Entry("f4", "H W", "px", "height toward the camera, NaN where unsupported"),
-    "surface/normals": Entry("f4", "H W 3", "1", "unit normal, n ∝ (-dz/dx, -dz/dy, 1), NaN where unsupported"),
+    "surface/height": Entry(
+        "f4", "H W", "px", "height toward the camera (perspective: px at the distance f), NaN where unsupported"
+    ),
+    "surface/normals": Entry(
+        "f4", "H W 3", "1", "unit normal in the camera's frame, ∝ (-dz/dx, -dz/dy, 1) if orthographic, else NaN"
+    ),
     "surface/valid": Entry("?", "H W", "1", "True where measurements support the surface"),
     "surface/normal_sigma": Entry("f4", "H W", "degree", "expected error of the normal"),
     "irradiance/map": Entry("f4", "H W", "relative", "linear irradiance, geometric mean 1 over valid, else NaN"),
@@ -100,7 +104,7 @@ def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any])
             "surface, normals and relative irradiance recovered from texture in one photograph (sftex)"
         )
         file.attrs["axes"] = AXES
-        file.attrs["camera"] = "orthographic"
+        file.attrs.update(_camera(arrays["surface"]))
         for name in ("image_name", "image_sha256", "config_yaml"):
             file.attrs[name] = str(meta[name])
         for name in ("keys", "versions"):
@@ -117,6 +121,15 @@ def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any])
         file.flush()
         image: bytes = file.id.get_file_image()
     return image
+
+
+def _camera(surface: Any) -> dict[str, Any]:
+    """The attributes `camera`, "orthographic" or "perspective"; the latter with `focal_px` and `principal_point` (x, y)."""
+    camera = str(surface["camera"])
+    if camera != "perspective":
+        return {"camera": camera}
+    centre = np.asarray(surface["principal_point"], float)
+    return {"camera": camera, "focal_px": float(surface["focal_px"]), "principal_point": centre}
 
 
 def _collect(arrays: Mapping[str, Any]) -> Arrays:

@@ -57,7 +57,7 @@ def stage_arrays() -> dict[str, Any]:
         "image": {"rgb": rgb, "mask": np.ones((H, W), bool)},
         "frontal": frontal,
         "surface": surface
-        | {"normal_sigma": np.full((H, W), 3, "f4"), "energy": np.array(1.0)}
+        | {"normal_sigma": np.full((H, W), 3, "f4"), "energy": np.array(1.0), "camera": np.array("orthographic")}
         | {f"instance/{k}": v for k, v in instance.items()},
         "irradiance": {
             "map": light.astype("f4"),

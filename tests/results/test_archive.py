@@ -86,10 +86,12 @@ def test_textons_beyond_the_last_used_one_have_no_class_scale(tmp_path: Path, ar
     np.testing.assert_array_equal(archive.open_result(tmp_path / "r.h5").textons["class_scale"], [1, 1.5, np.nan])
 
 
-def test_perspective_results_give_their_camera(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file.attrs["camera"], file.attrs["focal_px"], file.attrs["principal_point"] = "perspective", 900.0, [64.5, 44.5]
-    result = archive.open_result(path)
+def test_perspective_results_give_their_camera(tmp_path: Path, arrays: dict, meta: dict) -> None:
+    arrays["surface"] |= {
+        "camera": np.array("perspective"), "focal_px": np.array(900.0), "principal_point": np.array([64.5, 44.5])
+    }  # fmt: skip
+    (tmp_path / "r.h5").write_bytes(archive.encode(arrays, meta))
+    result = archive.open_result(tmp_path / "r.h5")
     assert (result.camera, result.focal_px, result.principal_point) == ("perspective", 900.0, (64.5, 44.5))
 
 

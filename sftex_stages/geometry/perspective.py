@@ -1,0 +1,190 @@
+"""Perspective: what a pinhole camera of focal length f adds to locally scaled orthography (sections 2, 6 of the paper).
+
+With range r along the ray of image point x, h(x) = −f log r takes the place of height. On the unit sphere of rays, with
+u the direction away from the principal point and cos the cosine of the ray's angle with the axis:
+
+- an image transform T is what that sphere shows, stretched: F T with F = I + (cos − 1) u uᵀ is the element as seen along its
+  own ray, up to scale;
+- the gradient relative to the ray is K grad h, K = (I + (1/cos − 1) u uᵀ) / cos, and the normal there is ∝ (−K grad h, 1);
+- an element's scale is s = c_k / r, so that log(cos σ_max(F T)) = h / f + const_k: element size is a depth map.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sftex_stages.geometry import gaussian, refine, spline
+
+Float = NDArray[np.floating]
+
+TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
+BENDS = (0.03, 1.5)  # and the range believed
+OFF = (1.0, 0.2, 0.2)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
+GAIN = 30.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Principal point (x, y) px and 1/f in 1/px, 0 for orthography."""
+
+    centre: tuple[float, float]
+    bend: float
+
+    def rays(self, xy: Float) -> tuple[Float, Float]:
+        """Unit directions u (…, 2) away from the principal point and cosines (…,) of the rays of `xy` (…, 2) px."""
+        offset = (np.asarray(xy, float) - self.centre) * self.bend
+        t = np.linalg.norm(offset, axis=-1)
+        u = np.where(t[..., None] > 1e-12, offset / np.maximum(t, 1e-12)[..., None], np.array([1.0, 0.0]))
+        return u, 1 / np.sqrt(1 + t**2)
+
+    def flatten(self, xy: Float) -> Float:
+        """F (N, 2, 2): takes image transforms to what the rays see."""
+        u, cosine = self.rays(xy)
+        return np.eye(2) + (cosine - 1)[:, None, None] * u[:, :, None] * u[:, None, :]
+
+    def stretch(self, xy: Float) -> Float:
+        """K (N, 2, 2): takes image gradients of h to slopes relative to the ray."""
+        u, cosine = self.rays(xy)
+        k = np.eye(2) + (1 / cosine - 1)[:, None, None] * u[:, :, None] * u[:, None, :]
+        return k / cosine[:, None, None]
+
+    def slopes(self, xy: Float, g: Float) -> Float:
+        """K g (…, 2) of gradients g (…, 2) at `xy` (…, 2)."""
+        u, cosine = self.rays(xy)
+        along = (u * g).sum(-1) * (1 / cosine - 1)
+        return (g + along[..., None] * u) / cosine[..., None]
+
+    def turn(self, xy: Float, normal: Float) -> Float:
+        """Normals (…, 3) relative to the rays of `xy` (…, 2) in the camera's frame, by the smallest rotation."""
+        if self.bend == 0:
+            return normal
+        u, cosine = self.rays(xy)
+        sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+        along = (u * normal[..., :2]).sum(-1)
+        # The ray toward the camera is (−sine u, cosine): what lay along z comes to lie along it.
+        radial = cosine * along - sine * normal[..., 2]
+        z = sine * along + cosine * normal[..., 2]
+        return np.concatenate((normal[..., :2] + (radial - along)[..., None] * u, z[..., None]), -1)
+
+    def height(self, xy: Float, h: Float) -> Float:
+        """Height z (…,) px toward the camera of h (…,): px as they are at the distance f, where h is 0 on the axis."""
+        if self.bend == 0:
+            return h
+        return (1 - np.exp(-h * self.bend) * self.rays(xy)[1]) / self.bend
+
+
+ORTHOGRAPHIC = Camera((0.0, 0.0), 0.0)
+
+
+def flatten_tensors(camera: Camera, xy: Float, w: Float, covariance: Float) -> tuple[Float, Float, Float]:
+    """w (N, 2) as the rays see it, its covariance (N, 2, 2), and the change (N,) of log scale, from w (`tensors.py`)."""
+
+    def seen(w: Float) -> tuple[Float, Float]:
+        half = np.hypot(w[:, 0], w[:, 1]) / 2
+        s = np.empty((len(w), 2, 2))
+        s[:, 0, 0], s[:, 1, 1] = 1 - half - w[:, 0] / 2, 1 - half + w[:, 0] / 2
+        s[:, 0, 1] = s[:, 1, 0] = -w[:, 1] / 2
+        s = flat @ s @ np.swapaxes(flat, 1, 2)
+        a, b = (s[:, 0, 0] - s[:, 1, 1]) / 2, s[:, 0, 1]
+        top = (s[:, 0, 0] + s[:, 1, 1]) / 2 + np.hypot(a, b)
+        return np.stack((-2 * a / top, -2 * b / top), 1), top
+
+    flat = camera.flatten(xy)
+    step = 1e-4 * np.eye(2)
+    jacobian = np.stack([(seen(w + step[k])[0] - seen(w - step[k])[0]) / 2e-4 for k in range(2)], 2)
+    value, top = seen(w)
+    change = 0.5 * np.log(top) + np.log(camera.rays(xy)[1])
+    return value, jacobian @ covariance @ np.swapaxes(jacobian, 1, 2), change
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Log scale of the elements at M nodes, up to one constant: `value` (M,), `variance` (M,), `trust` (M,) in 0…1."""
+
+    value: Float
+    variance: Float
+    trust: Float
+
+    def heights(self, camera: Camera, xy: Float, w: Float, change: Float) -> gaussian.Heights:
+        """Heights h (M,) px under a camera, at nodes `xy` (M, 2) of flattened w (M, 2); `change` (M,) of the log scale.
+
+        Blur, and elements that are not as flat as their frame, make steep elements look a little smaller or larger than
+        they are: what any even function of the slant explains proves no perspective. On a sphere nothing does.
+        """
+        bend, steep = camera.bend or 1.0, np.hypot(w[:, 0], w[:, 1])
+        precision = self.trust / self.variance * bend**2
+        value = (self.value + change - np.average(self.value, weights=self.trust)) / bend
+        columns = np.stack((np.ones_like(steep), steep, steep**2), 1)
+        return gaussian.Heights(value, precision, columns, np.array(OFF) / bend)
+
+    def unrelated(self, xy: Float, w: Float) -> float:
+        """Log likelihood in nats of one size for all elements, at the best noise factor."""
+        height = self.heights(ORTHOGRAPHIC, xy, w, np.zeros(len(w)))
+        return max(height.over(float(k)).unrelated() for k in np.geomspace(*refine.HEIGHT_FACTORS, 30))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind)."""
+
+    camera: Camera
+    gain: float
+    sign: float
+
+
+def choose(
+    grid: spline.Grid,
+    xy: Float,
+    w: Float,
+    covariance: Float,
+    sizes: Sizes,
+    start: Float,
+    smooth: gaussian.Smoothness,
+    centre: tuple[float, float],
+    size: float,
+    bend: float | None = None,
+) -> Choice:
+    """1/f of greatest evidence of tensors and element sizes together, for the surface near gradients `start` and its mirror.
+
+    Parameters
+    ----------
+    grid, xy, w, covariance
+        the field's grid; nodes (M, 2) with w (M, 2) of the image and its covariance (M, 2, 2).
+    start, smooth
+        gradients (M, 2) with signs relative to one another, and a smoothness to start from.
+    centre, size
+        principal point (x, y) and longer side of the image, px.
+    bend
+        1/f if it is known: only the sign is asked for then.
+    """
+
+    def evidence(bend: float, sign: float, sized: bool = True) -> float:
+        camera = Camera(centre, bend)
+        flat, spread, change = flatten_tensors(camera, xy, w, covariance)
+        f = gaussian.make_field(grid, xy, camera.stretch(xy))
+        height = sizes.heights(camera, xy, flat, change) if sized else None
+        value = refine.refine(f, flat, spread, sizes.trust, sign * start, smooth, 3, height).evidence
+        return value - (np.log(bend) * (sizes.trust > 0).sum() if sized else 0.0)  # density of sizes, not of heights
+
+    flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w) if bend is None else 0.0
+    found: dict[float, float] = {}
+    sign = 0.0
+    for trial in TRIALS if bend is None else (bend * size,):
+        up, down = (evidence(trial / size, s) for s in (1.0, -1.0))
+        found[trial], sign = max(up, down), up - down
+        if found[trial] > flat + GAIN or bend is not None:
+            break
+    else:
+        best = max(found, key=lambda k: found[k])
+        return Choice(Camera(centre, 0.0), found[best] - flat, 0.0)
+    if bend is None:
+        ratio = 1.6
+        for _ in range(5):
+            best = max(found, key=lambda k: found[k])
+            for k in (best * ratio, best / ratio):
+                if BENDS[0] <= k <= BENDS[1] and not any(abs(np.log(k / j)) < 0.01 for j in found):
+                    found[k] = evidence(k / size, np.sign(sign))
+            ratio = ratio if max(found, key=lambda k: found[k]) != best else ratio**0.5
+        bend = max(found, key=lambda k: found[k]) / size
+    return Choice(Camera(centre, bend), max(found.values()) - flat, sign)

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+
+from sftex_stages.geometry import blocks, gaussian, perspective, spline, tensors
+from sftex_stages.measures import relative_to_ray
+
+F, CENTRE, SIZE = 700.0, (200.0, 150.0), 400.0
+CAMERA = perspective.Camera(CENTRE, 1 / F)
+
+
+def range_of(xy):
+    """Range r along the ray, px, of a bumpy sheet given as a function of the image point."""
+    return F * np.exp(-h_of(xy) / F)
+
+
+def h_of(xy):
+    x, y = xy[..., 0], xy[..., 1]
+    return 30 * np.sin(x / 60) + 26 * np.cos(y / 55) + 0.25 * x - 0.1 * y
+
+
+def point(xy):
+    ray = np.stack((xy[..., 0] - CENTRE[0], xy[..., 1] - CENTRE[1], np.full(xy.shape[:-1], -F)), -1)
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True) * range_of(xy)[..., None]
+
+
+def derivative(function, xy):
+    e = 1e-4 * np.eye(2)
+    return np.stack([(function(xy + e[k]) - function(xy - e[k])) / 2e-4 for k in range(2)], -1)
+
+
+@pytest.fixture(scope="module")
+def view():
+    """Points, true normals in the camera's frame, and image transforms of unit circles on the surface there."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(np.arange(10, 400, 13.0), np.arange(10, 300, 13.0)), -1).reshape(-1, 2)
+    xy = grid + rng.uniform(-4, 4, grid.shape)
+    tangent = derivative(point, xy)  # (N, 3, 2): surface per image px
+    normal = np.cross(tangent[:, :, 0], tangent[:, :, 1])
+    normal *= np.where((normal * point(xy)).sum(1) > 0, -1, 1)[:, None] / np.linalg.norm(normal, axis=1)[:, None]
+    metric = np.swapaxes(tangent, 1, 2) @ tangent  # of the surface, in image coordinates
+    values, axes = np.linalg.eigh(np.linalg.inv(metric))
+    transform = axes @ (np.sqrt(values)[:, :, None] * np.swapaxes(axes, 1, 2))
+    return xy, normal, transform
+
+
+def seen(camera, xy, transform):
+    s = camera.flatten(xy) @ transform
+    s = s @ np.swapaxes(s, 1, 2)
+    top = np.linalg.eigvalsh(s)[:, 1]
+    s /= top[:, None, None]
+    return np.stack((s[:, 1, 1] - s[:, 0, 0], -2 * s[:, 0, 1]), 1), 0.5 * np.log(top)
+
+
+def test_slopes_tensors_and_sizes_are_those_of_a_pinhole_camera(view):
+    xy, normal, transform = view
+    slope = CAMERA.slopes(xy, derivative(h_of, xy))
+    assert np.allclose(slope, np.einsum("nij,nj->ni", CAMERA.stretch(xy), derivative(h_of, xy)))
+    assert np.allclose(CAMERA.turn(xy, tensors.normals(slope)), normal, atol=1e-6)
+    assert np.allclose(relative_to_ray(normal, xy, F, np.array(CENTRE)), tensors.normals(slope), atol=1e-6)
+    w, log_scale = seen(CAMERA, xy, transform)
+    assert np.allclose(w, tensors.predict(slope)[0], atol=1e-6)
+    size = log_scale + np.log(CAMERA.rays(xy)[1])
+    assert np.allclose(size, h_of(xy) / F, atol=1e-6)
+    z = CAMERA.height(xy, h_of(xy))
+    assert np.allclose(z, point(xy)[..., 2] + F, atol=1e-9)
+
+
+def test_flattened_tensors_are_those_of_flattened_transforms(view):
+    xy, _, transform = view
+    image, log_scale = seen(perspective.Camera(CENTRE, 0.0), xy, transform)
+    w, covariance, change = perspective.flatten_tensors(CAMERA, xy, image, np.tile(np.eye(2), (len(xy), 1, 1)))
+    expected, flat_scale = seen(CAMERA, xy, transform)
+    assert np.allclose(w, expected, atol=1e-9)
+    assert np.allclose(change, flat_scale - log_scale + np.log(CAMERA.rays(xy)[1]), atol=1e-9)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_orthography_changes_nothing():
+    xy = np.random.default_rng(0).uniform(0, 300, (20, 2))
+    camera = perspective.Camera(CENTRE, 0.0)
+    assert np.allclose(camera.flatten(xy), np.eye(2)) and np.allclose(camera.stretch(xy), np.eye(2))
+    assert np.array_equal(camera.height(xy, xy[:, 0]), xy[:, 0])
+
+
+def problem(view, noise, true):
+    """Nodes of the view (or of the same slopes under orthography) with noise, and their start."""
+    xy, _, transform = view
+    rng = np.random.default_rng(2)
+    slope = derivative(h_of, xy)
+    if true.bend:
+        w, log_scale = seen(perspective.Camera(CENTRE, 0.0), xy, transform)
+    else:
+        w, log_scale = tensors.predict(slope)[0], 0.1 * np.hypot(*tensors.predict(slope)[0].T)  # size follows slant
+    w = w + noise * rng.normal(size=w.shape)
+    sizes = perspective.Sizes(
+        log_scale + noise * rng.normal(size=len(xy)), np.full(len(xy), noise**2), np.ones(len(xy))
+    )
+    grid = spline.cover(xy.min(0) - 20, xy.max(0) + 20, 16.0)
+    covariance = np.tile(noise**2 * np.eye(2), (len(xy), 1, 1))
+    return grid, xy, w, covariance, sizes, slope
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_focal_length_and_sign_come_from_the_sizes(view, mirror):
+    grid, xy, w, covariance, sizes, slope = problem(view, 0.01, CAMERA)
+    smooth = gaussian.Smoothness(1.0, 40.0)
+    choice = perspective.choose(grid, xy, w, covariance, sizes, mirror * slope, smooth, CENTRE, SIZE)
+    assert abs(1 / choice.camera.bend / F - 1) < 0.1
+    assert choice.gain > 100 and choice.sign * mirror > 50
+
+
+def test_sizes_that_follow_the_slant_prove_no_perspective(view):
+    grid, xy, w, covariance, sizes, slope = problem(view, 0.01, perspective.Camera(CENTRE, 0.0))
+    smooth = gaussian.Smoothness(1.0, 40.0)
+    choice = perspective.choose(grid, xy, w, covariance, sizes, slope, smooth, CENTRE, SIZE)
+    assert choice.camera.bend == 0 and choice.sign == 0 and choice.gain < perspective.GAIN
+
+
+def test_heights_are_integrated_out_as_a_dense_gaussian():
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(0, 60, (12, 2))
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 60.0), 20.0), xy)
+    smooth = gaussian.Smoothness(1.0, 20.0)
+    columns = np.stack((np.ones(12), rng.uniform(size=12)), 1)
+    height = gaussian.Heights(rng.normal(size=12), rng.uniform(0.5, 2, 12), columns, np.array([3.0, 0.7]))
+    got = gaussian.log_evidence(f, np.zeros((12, 2, 2)), np.zeros((12, 2)), smooth, height)
+    size = f.grid.size
+    identity = np.eye(size)
+    prior = gaussian.posterior(f, np.zeros((12, 2, 2)), gaussian.prior(f, smooth))
+    covariance_a = blocks.solve(prior, identity)
+    design = np.asarray(spline.design(f.grid, xy).todense())
+    total = (
+        design @ covariance_a @ design.T
+        + columns @ np.diag(height.spread**2) @ columns.T
+        + np.diag(1 / height.precision)
+    )
+    expected = -0.5 * (height.value @ np.linalg.solve(total, height.value) + np.linalg.slogdet(2 * np.pi * total)[1])
+    assert got == pytest.approx(expected, rel=1e-6)
+    flat = columns @ np.diag(height.spread**2) @ columns.T + np.diag(1 / height.precision)
+    expected = -0.5 * (height.value @ np.linalg.solve(flat, height.value) + np.linalg.slogdet(2 * np.pi * flat)[1])
+    assert height.unrelated() == pytest.approx(expected, rel=1e-9)
