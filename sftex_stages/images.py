@@ -25,6 +25,9 @@ from .errors import InputError
 # A header may claim any size, and some decoders allocate when the file is opened, before its size can be looked at.
 oiio.attribute("limits:imagesize_MB", 16384)
 
+#: Rendered pictures have dozens; with more, a picture within the size limit could still fill the memory.
+_MOST_CHANNELS = 64
+
 ColorSpace = Literal["auto", "srgb", "linear"]
 
 #: Endings that OpenImageIO knows but that are no photographs.
@@ -137,6 +140,8 @@ def _read(path: Path, max_megapixels: float) -> tuple[np.ndarray, oiio.ImageSpec
     megapixels = spec.width * spec.height * spec.depth / 1e6
     if megapixels == 0 or spec.nchannels == 0:
         raise InputError(f"{path}: the image has no pixels ({spec.width} × {spec.height})")
+    if spec.nchannels > _MOST_CHANNELS:
+        raise InputError(f"{path}: has {spec.nchannels} channels, over the limit of {_MOST_CHANNELS}; save it as RGB")
     if spec.depth > 1:
         raise InputError(f"{path}: a volume of {spec.depth} layers, not a photograph")
     if megapixels > max_megapixels:

@@ -16,10 +16,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..errors import StoreError
 from . import keys, ledger
 from .keys import Identity
 from .stage import Arrays, Stage, StageParams
 from .store import Receipt, Store, stamp
+
+_MOST_PARTS = 100_000  # of one item: a receipt from elsewhere may claim anything
 
 
 @dataclass(frozen=True)
@@ -256,7 +259,10 @@ def _parts(stage: Stage, plan: Plan) -> Sequence[int | None]:
     if stage.fan_out is None:
         return [None]
     receipt = plan.steps[stage.fan_out].done[None]
-    return range(int(receipt["scalars"]["count"]))
+    count = int(receipt["scalars"]["count"])
+    if not 0 <= count <= _MOST_PARTS:
+        raise StoreError(f"{stage.fan_out} of {plan.item.name} claims {count} parts; at most {_MOST_PARTS} are planned")
+    return range(count)
 
 
 def _intact(folder: Path, files: Mapping[str, str], known: Mapping[str, str]) -> tuple[dict[str, str], str]:

@@ -54,7 +54,8 @@ def record(root: Path, config: str, plans: Sequence[Plan]) -> str:
     content = ledger.seal(document)
     try:
         if path.exists() and path.read_bytes() == content:
-            os.utime(path)
+            with contextlib.suppress(OSError):  # a store that may only be read
+                os.utime(path)
         else:
             write_atomically(path, content, root / "tmp")
     except OSError as error:

@@ -23,6 +23,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 import time
 import uuid
@@ -69,8 +70,9 @@ class Store:
                 probe.flush()
                 os.fsync(probe.fileno())
             for left_over in (self.root / "tmp").iterdir():  # of runs that were killed
-                if time.time() - left_over.stat().st_mtime > _STALE_TEMPORARY:
-                    left_over.unlink(missing_ok=True)
+                with contextlib.suppress(FileNotFoundError):  # another run may clear up too
+                    if time.time() - left_over.stat().st_mtime > _STALE_TEMPORARY:
+                        shutil.rmtree(left_over) if left_over.is_dir() else left_over.unlink()
         except OSError as error:
             raise StoreError(
                 f"{self.root.parent}: cannot be written ({error.strerror}); choose another output folder with --out"

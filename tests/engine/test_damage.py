@@ -1,10 +1,13 @@
 """Whatever happens to the files of the store: found, set aside, computed again with the same bytes."""
 
+import os
 import random
 import time
 
 import pytest
 import toy_pipeline as toy
+
+from sftex_stages.engine.store import Store
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +108,40 @@ def test_store_that_never_keeps_what_is_written_fails_the_image_and_ends(folder)
 
     results, _ = toy.run(folder / "out", folder / "a.txt", watcher=Vandal())
     assert "check the disk" in results["a"].error
+
+
+def test_what_killed_runs_left_is_cleared_away(folder):
+    """Files of runs, folders of restores; young ones may belong to a run that is going on."""
+    store = toy.planner(folder / "out").store
+    for name, age in {"old": 90000, "young": 100}.items():
+        for kind in ("file", "folder"):
+            path = store.root / "tmp" / f"{name}-{kind}"
+            if kind == "folder":
+                path.mkdir(parents=True)
+                (path / "1").write_text("x")
+            else:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text("x")
+            os.utime(path, (time.time() - age,) * 2)
+    store.prepare()
+    assert sorted(p.name for p in (store.root / "tmp").iterdir()) == ["young-file", "young-folder"]
+
+
+def test_absurd_number_of_parts_is_refused(folder):
+    results, _ = toy.run(folder / "out", folder / "a.txt", split={"parts": 10**9})
+    assert "split of a claims 1000000000 parts" in results["a"].error
+
+
+def test_unchanged_item_is_planned_from_its_ledger_alone(folder, monkeypatch):
+    """No receipt is opened, no artefact hashed: that is what makes thousands of cached images quick."""
+    toy.run(folder / "out", folder / "a.txt")
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "find", lambda *args: pytest.fail("looked up"))
+        plan = toy.planner(folder / "out").plan(toy.item(folder / "a.txt"))
+    assert plan.complete
+    (path,) = (folder / "out" / ".store" / "total").glob("??/*.h5")
+    os.utime(path)  # touched: hashed again, found intact
+    found = []
+    real = Store.find
+    monkeypatch.setattr(Store, "find", lambda self, *args: found.append(args[0]) or real(self, *args))
+    assert toy.planner(folder / "out").plan(toy.item(folder / "a.txt")).complete and found == ["total"]

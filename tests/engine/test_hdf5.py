@@ -3,6 +3,7 @@ import json
 import subprocess
 import sys
 
+import h5py
 import numpy as np
 import pytest
 
@@ -67,3 +68,25 @@ def test_canonical_json():
     assert keys.digest({"a": 0.1 + 0.2}) != keys.digest({"a": 0.3})
     with pytest.raises(ValueError):
         keys.canonical(float("nan"))
+
+
+def test_what_points_elsewhere_or_claims_too_much_is_not_decoded(tmp_path):
+    """As a restored artefact might: its hash is right, its content is not what `encode` writes."""
+    (tmp_path / "secret").write_bytes(bytes(8000))
+
+    def external(file):
+        file.create_dataset("x", (1000,), "f8", external=[(str(tmp_path / "secret"), 0, 8000)])
+
+    def huge(file):
+        file.create_dataset("x", (10**6, 10**6), "f8", chunks=(1000, 1000))
+
+    def virtual(file):
+        layout = h5py.VirtualLayout((1000,), "f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", (1000,))
+        file.create_virtual_dataset("x", layout)
+
+    for make, words in {external: "another file", virtual: "another file", huge: "declares .* GiB"}.items():
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            make(file)
+        with pytest.raises(ValueError, match=words):
+            decode((tmp_path / "a.h5").read_bytes())

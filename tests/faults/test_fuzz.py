@@ -1,7 +1,10 @@
 """Files from others, mutated: no crash, no hang, nothing outside. The process that matters is the one of the tests."""
 
 import os
+import resource
+import struct
 import time
+import zlib
 
 import h5py
 import numpy as np
@@ -142,6 +145,61 @@ def test_fuzzed_images(tmp_path, monkeypatch, rng, measured):
         f"{len(failed) - crashed} refused with a reason, {times - len(failed)} decoded, {crashed} ended their worker; "
     )
     measured("fuzzed images (PNG, JPEG, TIFF, EXR, BMP, WebP)", times, words + f"longest wait {clock.longest:.1f} s")
+
+
+def bombs():
+    """Small files that claim, or unpack to, far more than they hold."""
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    def png(width, height, extra, body):
+        header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        return b"\x89PNG\r\n\x1a\n" + header + extra + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+    def tiff(**more):
+        tags = {256: 64, 257: 64, 258: 8, 259: 1, 262: 1, 273: 8, 277: 1, 278: 64, 279: 64} | {
+            int(k[1:]): v for k, v in more.items()
+        }
+        body = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(tags.items()))
+        return b"II*\0" + struct.pack("<I", 72) + bytes(64) + struct.pack("<H", len(tags)) + body + bytes(4)
+
+    packed, rows = zlib.compress(bytes(100_000_000), 9), zlib.compress((b"\0" + bytes(8)) * 8)
+    yield "comment.png", png(8, 8, chunk(b"zTXt", b"Comment\0\0" + packed), rows)
+    yield "profile.png", png(8, 8, chunk(b"iCCP", b"x\0\0" + packed), rows)
+    yield "rows.png", png(8, 8, b"", packed)
+    yield "size.png", png(2**31 - 1, 2**31 - 1, b"", rows)
+    yield "size.tif", tiff(t256=2**31, t257=2**31)
+    yield "tile.tif", tiff(t322=2**26, t323=2**26, t324=8, t325=64)
+    yield "channels.tif", tiff(t277=1000)
+    yield (
+        "size.bmp",
+        b"BM" + struct.pack("<IHHIIiiHHIIiiII", 54, 0, 0, 54, 40, 60000, 60000, 1, 24, *[0] * 6) + bytes(99),
+    )
+    yield (
+        "size.jpg",
+        bytes.fromhex("ffd8ffc0001108ffffffff03011100021100031100ffda000c03010002110311003f00") + bytes(50),
+    )
+    yield "size.webp", b"RIFF" + struct.pack("<I", 30) + b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4) + b"\xff" * 6
+    yield "size.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n" + b"\2\2\0\0" * 10
+
+
+def test_bombs(tmp_path, measured):
+    """Refused, or read for what they are, in little time and memory."""
+    sizes = []
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for name, content in bombs():
+        (tmp_path / name).write_bytes(content)
+        started = time.monotonic()
+        try:
+            assert images.load_image(tmp_path / name)[0].shape == (8, 8, 3)
+        except InputError as error:
+            assert str(tmp_path / name) in str(error)
+        assert time.monotonic() - started < 5
+        sizes.append(len(content))
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024
+    assert grown < 500
+    measured("decompression bombs and absurd sizes", len(sizes), f"refused or harmless; {grown} MB more memory at most")
 
 
 @pytest.mark.parametrize("fault", [11, 9])
