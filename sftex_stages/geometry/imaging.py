@@ -35,14 +35,6 @@ def lemma1_residual(transform: Array) -> Array:
     return det**2 - (transform**2).sum((-2, -1)) + 1.0
 
 
-def singular_values(transform: Array) -> tuple[Array, Array]:
-    """Larger and smaller singular value of (..., 2, 2) matrices, in closed form."""
-    a, b = transform[..., 0, 0], transform[..., 0, 1]
-    c, d = transform[..., 1, 0], transform[..., 1, 1]
-    sum_, dif = np.hypot(a + d, c - b), np.hypot(a - d, b + c)
-    return (sum_ + dif) / 2, np.abs(sum_ - dif) / 2
-
-
 def tensor_of(transform: Array, scale: Array | float = 1.0) -> Array:
     """(xx, xy, yy) of T Tᵀ / s² = I − n_xy n_xyᵀ, shape (..., 3)."""
     scaled = transform / np.asarray(scale)[..., None, None]
@@ -67,14 +59,6 @@ def tensor_of_normal(normal: Array) -> Array:
     """(xx, xy, yy) of I − n_xy n_xyᵀ for unit normals (..., 3)."""
     nx, ny = normal[..., 0], normal[..., 1]
     return np.stack([1.0 - nx * nx, -nx * ny, 1.0 - ny * ny], -1)
-
-
-def nearest_transform(matrix: Array, scale: Array | float) -> Array:
-    """The s R F R nearest to `matrix` (..., 2, 2): larger singular value set to `scale`, the smaller kept below it."""
-    u, sigma, vt = np.linalg.svd(matrix)
-    scale = np.broadcast_to(np.asarray(scale, float), sigma[..., 0].shape)
-    sigma = np.stack([scale, np.minimum(sigma[..., 1], scale)], -1)
-    return (u * sigma[..., None, :]) @ vt
 
 
 def normal_angle(a: Array, b: Array) -> Array:

@@ -6,11 +6,9 @@ import pytest
 from sftex_stages.geometry.imaging import (
     compose,
     lemma1_residual,
-    nearest_transform,
     normal_angle,
     normal_of_tensor,
     rotation,
-    singular_values,
     tensor_of,
     tensor_of_normal,
 )
@@ -148,27 +146,6 @@ def test_normal_of_a_noisy_tensor_is_of_its_leading_direction_and_always_unit(rn
     seen = values[:, 1] > 0.01
     along = np.einsum("ni,ni->n", normal[seen, :2], vectors[seen, :, 1]) / np.linalg.norm(normal[seen, :2], axis=1)
     assert np.abs(along) == pytest.approx(np.ones(seen.sum()))
-
-
-def test_singular_values_in_closed_form(rng):
-    matrix = rng.normal(size=(N, 2, 2))
-    expected = np.linalg.svd(matrix, compute_uv=False)
-    assert np.stack(singular_values(matrix), -1) == pytest.approx(expected, abs=1e-12)
-
-
-def test_nearest_transform_is_one_and_no_other_is_nearer(rng):
-    matrix, scale = rng.normal(size=(200, 2, 2)), rng.uniform(0.5, 2, 200)
-    matrix[np.linalg.det(matrix) < 0, :, 0] *= -1
-    nearest = nearest_transform(matrix, scale)
-    assert np.abs(lemma1_residual(nearest / scale[:, None, None])).max() < 1e-9
-    assert np.linalg.svd(nearest, compute_uv=False)[:, 0] == pytest.approx(scale)
-    distance = np.linalg.norm(nearest - matrix, axis=(1, 2))
-    for _ in range(200):
-        tilt, slant, spin = random_angles(rng, 200)
-        other = np.linalg.norm(compose(tilt, slant, spin, scale) - matrix, axis=(1, 2))
-        assert (other >= distance - 1e-9).all()
-    exact = compose(*random_angles(rng, 200), scale)
-    assert nearest_transform(exact, scale) == pytest.approx(exact, abs=1e-9)
 
 
 def test_angle_is_exact_for_small_and_large_angles():
