@@ -53,8 +53,8 @@ def read_hdf5(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The root's attributes (plain Python) and those of the datasets `names` that are there.
 
-    `what`: kind of file, for messages. `check(attributes, declared)` is called before any data is read and may raise. Text comes as '<U…'. Raises
-    InputError, which names the file, for everything that is wrong with it.
+    `what`: kind of file, for messages. `check(attributes, declared)` is called before any data is read and may raise.
+    Text comes as '<U…'. Raises InputError, which names the file, for everything that is wrong with it.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such {what} file")
