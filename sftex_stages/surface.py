@@ -13,6 +13,7 @@ from sftex_stages.engine.stage import Arrays, Stage, StageParams
 from sftex_stages.errors import StageError
 from sftex_stages.geometry import (
     calibration,
+    confidence,
     gaussian,
     perspective,
     pooling,
@@ -119,6 +120,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     -------
     height (H, W) px toward the camera, mean 0 (perspective: px as they are at the distance f); normals (H, W, 3) in the
     camera's frame; valid (H, W) bool; normal_sigma (H, W) degrees, the root mean square angle expected; NaN where not valid.
+    piece (H, W) int32, connected pieces of `valid` from 1, 0 elsewhere: their heights relative to one another are guessed.
     instance/… (N, …), members of usable textons: xy, transform, inlier, irradiance, irradiance_sigma as delivered; normal
     calibrated, its sign resolved; normal_sigma of the surface there; texton; state, posteriors of {as delivered, the other
     sign, not from the surface}; sign_margin, nats by which the energy rises if the patch around flips (NaN: not used).
@@ -267,13 +269,15 @@ def outputs(
     stencil = np.stack((p, spline.stencil(field.grid, instances.xy, 0, 1)[1]), 1)
     stencil = camera.stretch(instances.xy) @ stencil
     g = np.einsum("npk,nk->np", stencil, solution.a[index])
-    spread = support.EXCESS * support.covariance_at(field.grid, solution.factor, instances.xy, camera)
-    spread += tensors.common_error(g, instances.calibration.common)
+    posterior = support.covariance_at(field.grid, solution.factor, instances.xy, camera)
+    k, found = instances.trust > 0, instances.calibration
+    errors = confidence.errors(instances.xy[k], found.w[k], instances.covariance[k], g[k], found.common)
+    spread = confidence.spread(errors, instances.xy, g, posterior)
     state = posterior_states(instances, g, spread)
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
-    common = instances.calibration.common
-    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing, common, camera)
-    valid = maps["supported"] & mask
+    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing, errors, camera)
+    piece = support.pieces(maps["supported"] & mask, spacing**2)
+    valid = piece > 0
     nan = np.float32(np.nan)
     mean = maps["height"][valid].mean() if valid.any() else 0.0
     height = (maps["height"] - mean) / (1 - mean * camera.bend)  # under perspective a change of the unit, as it must be
@@ -281,6 +285,7 @@ def outputs(
         "height": np.where(valid, height, nan).astype(np.float32),
         "normals": np.where(valid[..., None], maps["normals"], nan).astype(np.float32),
         "valid": valid,
+        "piece": piece,
         "normal_sigma": np.where(valid, maps["sigma"], nan).astype(np.float32),
         "instance/xy": table["xy"].astype(np.float32),
         "instance/transform": table["transform"].astype(np.float32),
@@ -330,4 +335,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=2, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=3, params=Params, run=run, inputs=("image", "frontal"))

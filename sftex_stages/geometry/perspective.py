@@ -21,7 +21,7 @@ Float = NDArray[np.floating]
 TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
 OFF = (1.0, 0.2, 0.2)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
-GAIN = 30.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
+GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ class Sizes:
         columns = np.stack((np.ones_like(steep), steep, steep**2), 1)
         return gaussian.Heights(value, precision, columns, np.array(OFF) / bend)
 
-    def unrelated(self, xy: Float, w: Float) -> float:
+    def unrelated(self, xy: Float, w: Float, change: Float) -> float:
         """Log likelihood in nats of one size for all elements, at the best noise factor."""
-        height = self.heights(ORTHOGRAPHIC, xy, w, np.zeros(len(w)))
+        height = self.heights(ORTHOGRAPHIC, xy, w, change)
         return max(height.over(float(k)).unrelated() for k in np.geomspace(*refine.HEIGHT_FACTORS, 30))
 
 
@@ -167,7 +167,7 @@ def choose(
         value = refine.refine(f, flat, spread, sizes.trust, sign * start, smooth, 3, height).evidence
         return value - (np.log(bend) * (sizes.trust > 0).sum() if sized else 0.0)  # density of sizes, not of heights
 
-    flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w) if bend is None else 0.0
+    flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w, np.zeros(len(w))) if bend is None else 0.0
     found: dict[float, float] = {}
     sign = 0.0
     for trial in TRIALS if bend is None else (bend * size,):
@@ -187,4 +187,9 @@ def choose(
                     found[k] = evidence(k / size, np.sign(sign))
             ratio = ratio if max(found, key=lambda k: found[k]) != best else ratio**0.5
         bend = max(found, key=lambda k: found[k]) / size
+        # Tensors alone may like any bend, toward rims above all: the sizes must say by themselves that they follow depth.
+        bent, _, change = flatten_tensors(Camera(centre, bend), xy, w, covariance)
+        own = max(found.values()) - evidence(bend, 1.0, False) - sizes.unrelated(xy, bent, change)
+        if own < GAIN:
+            return Choice(Camera(centre, 0.0), own, 0.0)
     return Choice(Camera(centre, bend), max(found.values()) - flat, sign)

@@ -5,13 +5,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, perspective, spline, tensors
+from sftex_stages.geometry import blocks, confidence, gaussian, perspective, spline, tensors
 
 Float = NDArray[np.floating]
 
 GAPS = 2.7  # reach of a measurement, in the typical (median) distance of a point from its nearest measurement
-EXCESS = 2.0  # of the variance: neighbouring instances share errors that the posterior counts as independent
-WORST = 20.0  # degrees; a normal less certain than this is not reported
+BEYOND = 0.5  # of that reach, where measurements lie on one side only: past a border, or a silhouette
+WORST = 30.0  # degrees; a normal less certain than this is not reported
 
 
 def typical_gap(xy: Float, spacing: float) -> float:
@@ -37,6 +37,14 @@ def distance(seen: Float, at: Float) -> Float:
     return np.asarray(cKDTree(seen).query(at)[0])
 
 
+def surrounded(xy: Float, at: Float, count: int = 24) -> NDArray[np.bool_]:
+    """Whether points `at` (P, 2) lie in the convex hull of their `count` nearest of `xy` (N, 2)."""
+    offset = xy[cKDTree(xy).query(at, min(count, len(xy)))[1].reshape(len(at), -1)] - at[:, None]
+    angle = np.sort(np.arctan2(offset[..., 1], offset[..., 0]), 1)
+    gap = np.diff(angle, axis=1, append=angle[:, :1] + 2 * np.pi)
+    return np.asarray(gap.max(1) < np.pi)
+
+
 def dense(
     f: gaussian.Field,
     a: Float,
@@ -44,12 +52,12 @@ def dense(
     shape: tuple[int, int],
     xy: Float,
     spacing: float,
-    common: float,
+    errors: confidence.Errors,
     camera: perspective.Camera = perspective.ORTHOGRAPHIC,
 ) -> dict[str, NDArray]:
     """Maps of an image of `shape` (H, W): `height` px, `normals` (H, W, 3), `sigma` degrees, `supported`.
 
-    `xy` (N, 2) are the measurements believed, `common` the error of w they share (`calibration.py`). Height and gradient
+    `xy` (N, 2) are the measurements believed, `errors` what the instances show of them. Height and gradient
     are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster and interpolated.
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
@@ -61,13 +69,14 @@ def dense(
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
     slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
     slope = camera.slopes(points, slope)
-    spread = EXCESS * covariance_at(f.grid, factor, points, camera) + tensors.common_error(slope, common)
+    spread = confidence.spread(errors, points, slope, covariance_at(f.grid, factor, points, camera))
     sigma = np.degrees(tensors.angular_error(slope, spread)).reshape(len(at_y), len(at_x))
     height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(f.grid, xy)
     seen = np.concatenate((xy, (stencil * a[index]).sum(1, keepdims=True)), 1)
     reach = GAPS * max(typical_gap(xy, spacing), 0.4 * spacing)
     far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach
+    far /= np.where(surrounded(xy, points).reshape(far.shape), 1.0, BEYOND)
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {
         "height": camera.height(pixels, spline.evaluate(f.grid, a, columns, rows)),
@@ -75,6 +84,19 @@ def dense(
         "sigma": sigma,
         "supported": (far <= 1) & (sigma <= WORST),
     }
+
+
+def pieces(valid: NDArray[np.bool_], least: float) -> NDArray[np.int32]:
+    """Label (H, W) of the connected pieces of `valid`, from 1, the largest first; 0 elsewhere and on specks under `least` px².
+
+    A depth jump parts them as well: no normal is certain enough there to be valid.
+    """
+    count, label, stats, _ = cv2.connectedComponentsWithStats(valid.astype(np.uint8), connectivity=4)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    order = np.argsort(-area, kind="stable")
+    new = np.zeros(count, np.int32)
+    new[1 + order] = np.where(area[order] >= least, np.arange(1, count), 0)
+    return new[label]
 
 
 def covariance_at(

@@ -55,10 +55,11 @@ def gradient(w: Float, covariance: Float) -> tuple[Float, Float]:
     return direction * slope(size)[:, None], inverse @ covariance @ np.swapaxes(inverse, 1, 2)
 
 
-def common_error(g: Float, common: float) -> Float:
-    """Covariance (N, 2, 2) of gradients `g` (N, 2) that an error of w with that standard deviation causes."""
+def common_error(g: Float, common: float | Float) -> Float:
+    """Covariance (N, 2, 2) of gradients `g` (N, 2) that an error of w with that standard deviation, or those (N,), causes."""
     w, _ = predict(g)
-    return gradient(w, np.broadcast_to(common**2 * np.eye(2), (len(g), 2, 2)))[1]
+    variance = np.broadcast_to(np.square(common), len(g))
+    return gradient(w, variance[:, None, None] * np.eye(2))[1]
 
 
 def normals(g: Float) -> Float:

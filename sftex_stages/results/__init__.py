@@ -17,7 +17,7 @@ from ..errors import StoreError
 from . import archive, exports, pictures, render
 
 #: Raise it whenever a file's content or the list of files changes: with it the files are written anew.
-VERSION = 3
+VERSION = 4
 
 #: The files of one photograph's folder, in the order in which they are written.
 FILES = {

@@ -42,6 +42,7 @@ SCHEMA = {
         "f4", "H W 3", "1", "unit normal in the camera's frame, ∝ (-dz/dx, -dz/dy, 1) if orthographic, else NaN"
     ),
     "surface/valid": Entry("?", "H W", "1", "True where measurements support the surface"),
+    "surface/piece": Entry("i4", "H W", "1", "connected piece of valid, from 1; offsets between pieces are guessed; else 0"),
     "surface/normal_sigma": Entry("f4", "H W", "degree", "expected error of the normal"),
     "irradiance/map": Entry("f4", "H W", "relative", "linear irradiance, geometric mean 1 over valid, else NaN"),
     "instances/xy": Entry("f4", "N 2", "px", "centre in the image"),
@@ -78,6 +79,7 @@ class Result:
     height: np.ndarray  # (H, W) px
     normals: np.ndarray  # (H, W, 3)
     valid: np.ndarray  # (H, W) bool
+    piece: np.ndarray  # (H, W) int32
     normal_sigma: np.ndarray  # (H, W) degrees
     irradiance: np.ndarray  # (H, W) relative
     instances: Mapping[str, np.ndarray]
@@ -135,7 +137,7 @@ def _camera(surface: Any) -> dict[str, Any]:
 def _collect(arrays: Mapping[str, Any]) -> Arrays:
     """The schema's datasets from the stages' arrays."""
     surface, irradiance, frontal = arrays["surface"], arrays["irradiance"], arrays["frontal"]
-    data: Arrays = {f"surface/{n}": surface[n] for n in ("height", "normals", "valid", "normal_sigma")}
+    data: Arrays = {f"surface/{n}": surface[n] for n in ("height", "normals", "valid", "piece", "normal_sigma")}
     data["irradiance/map"] = irradiance["map"]
     for name in SCHEMA:
         group, _, short = name.partition("/")
@@ -214,7 +216,7 @@ def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
         raise InputError(f"{path}: not a whole result file ({e}); run sftex again to make it anew") from e
     return Result(
         path=path,
-        **{n: data[f"surface/{n}"] for n in ("height", "normals", "valid", "normal_sigma")},
+        **{n: data[f"surface/{n}"] for n in ("height", "normals", "valid", "piece", "normal_sigma")},
         irradiance=data["irradiance/map"],
         instances={n.partition("/")[2]: a for n, a in data.items() if n.startswith("instances/")},
         textons={n.partition("/")[2]: a for n, a in data.items() if n.startswith("textons/")},

@@ -1,6 +1,6 @@
 import numpy as np
 
-from sftex_stages.geometry import gaussian, refine, spline, support, tensors
+from sftex_stages.geometry import confidence, gaussian, refine, spline, support, tensors
 
 
 def exact(seed=0):
@@ -65,11 +65,50 @@ def test_support_follows_the_surface_and_leaves_holes():
     f = gaussian.make_field(spline.cover(np.full(2, -40.0), np.full(2, 340.0), 20.0), xy)
     weight = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
     factor = gaussian.posterior(f, weight, gaussian.prior(f, gaussian.Smoothness(1.0, 30.0)))
-    maps = support.dense(f, np.zeros(f.grid.size), factor, (300, 300), xy, 20.0, 0.004)
+    errors = confidence.Errors(xy, np.zeros_like(xy), np.full(len(xy), 0.7), 0.004)
+    maps = support.dense(f, np.zeros(f.grid.size), factor, (300, 300), xy, 20.0, errors)
     assert not maps["supported"][150, 150] and maps["supported"][20, 20] and maps["supported"][299, 150]
     assert 0.6 < maps["supported"].mean() < 0.95
     assert maps["sigma"][150, 150] > 2 * maps["sigma"][30, 30]
     assert np.allclose(maps["normals"], [0, 0, 1])
     # The same instances on a steep slope are further apart on the surface, and reach less far in the image.
     steep = np.linalg.lstsq(spline.design(f.grid, xy).toarray(), 3 * xy[:, 0], rcond=None)[0]
-    assert support.dense(f, steep, factor, (300, 300), xy, 20.0, 0.004)["supported"].mean() < maps["supported"].mean()
+    assert support.dense(f, steep, factor, (300, 300), xy, 20.0, errors)["supported"].mean() < maps["supported"].mean()
+
+
+def test_pieces_are_connected_and_no_specks():
+    valid = np.zeros((40, 60), bool)
+    valid[5:15, 5:15] = valid[5:35, 20:50] = True
+    valid[38, 58] = valid[15, 15] = True
+    label = support.pieces(valid, 4.0)
+    assert (label[5:35, 20:50] == 1).all() and (label[5:15, 5:15] == 2).all()
+    assert label[38, 58] == 0 and label[15, 15] == 0 and label.dtype == np.int32
+    assert ((label > 0).sum() == 1000) and (support.pieces(valid & False, 1.0) == 0).all()
+
+
+def test_noise_and_misfit_nearby_widen_the_spread():
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(0, 400, (4000, 2))
+    g = np.tile([0.8, 0.3], (len(xy), 1))
+    stated = np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
+    size = np.where(xy[:, 0] < 200, 0.01, 0.03)
+    w = tensors.predict(g)[0] + size[:, None] * rng.normal(size=xy.shape)
+    w[xy[:, 1] > 300] += 0.05
+    e = confidence.errors(xy, w, stated, g, 0.0)
+    at = np.array([[100.0, 100], [300.0, 100], [100.0, 380]])
+    posterior = np.tile(1e-4 * np.eye(2), (3, 1, 1))
+    quiet, noisy, misfit = (np.trace(c) for c in confidence.spread(e, at, g[:3], posterior))
+    assert quiet < noisy < misfit
+    expected = (
+        confidence.EXCESS * 9e-4 * 2
+    )  # three times the stated noise, and a median misfit of about its standard error
+    assert 0.5 * expected < noisy < 2.5 * expected
+    shared = tensors.common_error(g[:1], confidence.HIDDEN * 0.05)[0]
+    assert abs(misfit / np.trace(shared) - 1) < 0.4
+
+
+def test_surrounded_is_inside_of_the_hull_of_the_neighbours():
+    x, y = np.meshgrid(np.arange(0.0, 100, 10), np.arange(0.0, 100, 10))
+    xy = np.stack((x.ravel(), y.ravel()), 1)
+    at = np.array([[45.0, 52.0], [3.0, 80.0], [-4.0, 50.0], [95.0, 95.0]])
+    assert list(support.surrounded(xy, at)) == [True, True, False, False]

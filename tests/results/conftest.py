@@ -58,6 +58,7 @@ def stage_arrays() -> dict[str, Any]:
         "frontal": frontal,
         "surface": surface
         | {"normal_sigma": np.full((H, W), 3, "f4"), "energy": np.array(1.0), "camera": np.array("orthographic")}
+        | {"piece": surface["valid"].astype("i4")}
         | {f"instance/{k}": v for k, v in instance.items()},
         "irradiance": {
             "map": light.astype("f4"),

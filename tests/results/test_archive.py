@@ -24,7 +24,7 @@ def path(tmp_path: Path, arrays: dict, meta: dict) -> Path:
 def test_round_trip(path: Path, arrays: dict, meta: dict) -> None:
     result = sftex_stages.open_result(path)
     surface = arrays["surface"]
-    for name in ("height", "normals", "valid", "normal_sigma"):
+    for name in ("height", "normals", "valid", "piece", "normal_sigma"):
         np.testing.assert_array_equal(getattr(result, name), surface[name])
         assert getattr(result, name).dtype == surface[name].dtype
     np.testing.assert_array_equal(result.irradiance, arrays["irradiance"]["map"])
