@@ -39,7 +39,7 @@ SCHEMA = {
         "f4", "H W", "px", "height toward the camera (perspective: px at the distance f), NaN where unsupported"
     ),
     "surface/normals": Entry(
-        "f4", "H W 3", "1", "unit normal in the camera's frame, ∝ (-dz/dx, -dz/dy, 1) if orthographic, else NaN"
+        "f4", "H W 3", "1", "unit normal in the camera's frame (orthographic: ∝ (-dz/dx, -dz/dy, 1)), NaN where unsupported"
     ),
     "surface/valid": Entry("?", "H W", "1", "True where measurements support the surface"),
     "surface/piece": Entry("i4", "H W", "1", "connected piece of valid, from 1; offsets between pieces are guessed; else 0"),
