@@ -1,6 +1,7 @@
 """The real pipeline on a real file: the same bytes with one and two jobs, in different folders; little time lost."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,8 @@ pytestmark = pytest.mark.skipif(not LONG, reason="long set: make faults")
 def reconstruct(folder, out, jobs):
     """The JSON of a run of the whole pipeline."""
     command = [sys.executable, "-m", "sftex_stages.cli", "run", "in", "--out", out, "--jobs", str(jobs), "--json"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
