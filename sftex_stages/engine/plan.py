@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import StoreError
 from . import keys, ledger
@@ -49,8 +49,7 @@ class Delivery:
     name: str = "outputs"
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """An upstream artefact: where it is and what it must hash to."""
 
     stage: str
@@ -86,7 +85,9 @@ class Step:
     ahead: list[str] = field(default_factory=list)  # why it will run in any case, known while it still waits
     expected: int | None = None  # number of jobs: the last run's while it waits, None if there was none
     identity: Identity | None = None  # of all parts together
+    remembered: bool = False  # all of it was in the item's ledger
     delivered: dict[str, str] = field(default_factory=dict)  # of a delivery: its intact files and their stamps
+    _sources: list[Source] | None = None
 
     @property
     def complete(self) -> bool:
@@ -95,9 +96,9 @@ class Step:
 
     def sources(self) -> Source | list[Source]:
         """This complete step's artefacts, as input of others."""
-        receipts = self.done.values()  # in part order, as they were planned
-        found = [Source(self.stage, r["key"], r["artefact"]["sha256"]) for r in receipts]
-        return found if self.fanned else found[0]
+        if self._sources is None:  # in part order, as they were planned
+            self._sources = [Source(self.stage, r["key"], r["artefact"]["sha256"]) for r in self.done.values()]
+        return self._sources if self.fanned else self._sources[0]
 
 
 @dataclass
@@ -171,9 +172,17 @@ class Planner:
         upstream = {name: _content(sources) for name, sources in inputs.items()}
         paths = {name: str(path) if (path := plan.item.files[name]) else None for name in stage.files}
         identity = step.identity = keys.job_identity(stage, self.params[stage.name], upstream, files, None)
-        known = _known(last, identity)
+        # the same identity has the same keys: they, and what was verified, need not be worked out again
+        known = {part: receipt for part, receipt in last["jobs"]} if last and last["identity"] == identity else {}
+        step.remembered = bool(known)
         for part in _parts(stage, plan):
-            key, receipt, problem = self._look(stage.name, {**identity, "part": part}, known.get(part))
+            receipt = known.get(part)
+            if receipt and self.store.trust(stage.name, receipt):
+                key, problem = receipt["key"], ""
+            else:
+                step.remembered = False
+                key = keys.digest({**identity, "part": part})
+                receipt, problem = self.store.find(stage.name, key, self.repair)
             step.keys.append(key)
             if receipt and stage.name in self.force and (stage.name, key) not in self.store.fresh:
                 self.replaced[key] = receipt["artefact"]["sha256"]
@@ -202,7 +211,12 @@ class Planner:
             "inputs": {name: _content(sources) for name, sources in inputs.items()}, "files": {}, "part": None,
         }  # fmt: skip
         folder = delivery.folder / plan.item.name
-        key, receipt, problem = self._look(delivery.name, identity, _known(last, identity).get(None))
+        receipt, problem = last["jobs"][0][1] if last and last["identity"] == identity else None, ""
+        if receipt and self.store.trust(delivery.name, receipt):
+            key = receipt["key"]
+        else:
+            key = keys.digest(identity)
+            receipt, problem = self.store.find(delivery.name, key, self.repair)
         step.keys.append(key)
         if receipt and delivery.name in self.force and (delivery.name, key) not in self.store.fresh:
             receipt, problem = None, "forced"
@@ -219,13 +233,6 @@ class Planner:
             step.todo.append((job, self._why(job) or problem or "not in the cache any more"))
         return step
 
-    def _look(self, stage: str, identity: Identity, known: Receipt | None) -> tuple[str, Receipt | None, str]:
-        """Key, verified receipt (None: not done) and problem of one job; `known`: what the ledger says of it."""
-        if known and self.store.trust(stage, known):
-            return known["key"], known, ""
-        key = keys.digest(identity)
-        return key, *self.store.find(stage, key, self.repair)
-
     def _why(self, job: Job) -> str:
         """Compare with what the last run of the same item found; "" if there is no difference."""
         last = self._ledgers[job.item].get(job.stage)
@@ -238,7 +245,7 @@ class Planner:
         old = self._ledgers[plan.item.name]
         steps = dict(old)
         for name, step in plan.steps.items():
-            if step.complete and step.identity:
+            if step.complete and step.identity and not step.remembered:
                 steps[name] = ledger.entry(step.identity, step.done, step.delivered)
         if steps != old:
             self._ledgers[plan.item.name] = steps
@@ -248,11 +255,6 @@ class Planner:
 
 def _content(sources: Source | list[Source]) -> str | list[str]:
     return [source.sha256 for source in sources] if isinstance(sources, list) else sources.sha256
-
-
-def _known(last: Mapping[str, Any] | None, identity: Identity) -> dict[int | None, Receipt]:
-    """The ledger's jobs of a stage, by part. The same identity has the same keys: they need not be worked out again."""
-    return {part: receipt for part, receipt in last["jobs"]} if last and last["identity"] == identity else {}
 
 
 def _parts(stage: Stage, plan: Plan) -> Sequence[int | None]:
