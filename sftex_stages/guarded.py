@@ -24,7 +24,7 @@ import numpy as np
 
 from .errors import InputError
 
-PATIENCE = 10.0  # seconds without a byte from the child
+PATIENCE = 6.0  # seconds without a byte from the child
 _SLAB = 16 << 20  # bytes sent at a time
 _MOST_HEADER = 64 << 20
 _FAILED = (1 << 64) - 1  # in place of a slab's length

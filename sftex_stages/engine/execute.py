@@ -19,7 +19,7 @@ from typing import Protocol
 
 from ..errors import SftexError
 from .plan import Item, Job, Plan, Planner
-from .store import DamagedError, Receipt
+from .store import DamagedError, Receipt, read_receipt
 from .worker import Outcome, Task, perform, start
 
 _MOST_ATTEMPTS = 3  # at one job: a store that loses what was just written is not worked around for ever
@@ -240,9 +240,9 @@ def _alone(task: Task, planner: Planner) -> Outcome:
     """Run a suspect in a process of its own; if that dies too, the suspect is the killer."""
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    receipt = None if task.job.stage in planner.force else planner.store.find(task.job.stage, task.job.key)[0]
-    if receipt:  # it was published just before the crash
-        return Outcome(task.job, receipt=receipt)
+    job, store = task.job, planner.store
+    if job.stage not in planner.force and store.find(job.stage, job.key)[0]:  # it was published just before the crash
+        return Outcome(job, receipt=read_receipt(store.path(job.stage, job.key, ".json"))[0])
     try:
         return next(iter(_parallel(iter([task]), 1)))
     except BrokenProcessPool as error:

@@ -20,7 +20,6 @@ from typing import Any
 from .store import Receipt, write_atomically
 
 Steps = dict[str, dict[str, Any]]  # stage -> {"identity", "jobs": [[part, short receipt], ...], "files": {name: stamp}}
-_SHORT = ("key", "artefact", "scalars", "files", "software", "stamps")  # of a receipt: what plans need
 
 
 def path_of(root: Path, label: str) -> Path:
@@ -72,7 +71,7 @@ def _expand(document: dict[str, Any]) -> Steps:
 
 def entry(identity: dict[str, Any], done: dict[int | None, Receipt], delivered: dict[str, str]) -> dict[str, Any]:
     """The ledger's entry of a complete stage; `delivered`: files of a delivery, with their stamps."""
-    jobs = [[part, {name: receipt[name] for name in _SHORT if name in receipt}] for part, receipt in done.items()]
+    jobs = [[part, receipt] for part, receipt in done.items()]
     return {"identity": identity, "jobs": jobs} | ({"files": delivered} if delivered else {})
 
 

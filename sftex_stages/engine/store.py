@@ -81,8 +81,9 @@ class Store:
     def find(self, stage: str, key: str, repair: bool = True) -> tuple[Receipt | None, str]:
         """The verified receipt of a finished job, or None and the reason in words ("" if it simply was never done).
 
-        The receipt has an entry more than its file: "stamps", of the receipt's and of the artefact's file when their
-        bytes were hashed. Damaged files are set aside (unless not `repair`), so that the job can be done again.
+        Of the receipt comes what plans need (key, artefact, files, software, and of the scalars counts and yes or no),
+        and "stamps", of its file and the artefact's when their bytes were hashed. Damaged files are set aside (unless
+        not `repair`), so that the job can be done again.
         """
         if (stage, key) in self._verified:
             return self._verified[stage, key], ""
@@ -95,25 +96,27 @@ class Store:
         except (OSError, ValueError, KeyError) as error:
             return None, self._damaged(stage, key, f"damaged receipt ({_mendable(error)})", repair)
         try:
-            receipt["stamps"] = [own, self._check_artefact(stage, key, receipt)]
+            stamps = [own, self._check_artefact(stage, key, receipt)]
         except FileNotFoundError:
             return None, "artefact removed"
         except (OSError, ValueError) as error:
             return None, self._damaged(stage, key, f"damaged artefact ({_mendable(error)})", repair)
-        self._verified[stage, key] = receipt
-        return receipt, ""
+        found: Receipt = {name: receipt[name] for name in ("key", "artefact", "files", "software") if name in receipt}
+        scalars = {name: value for name, value in receipt.get("scalars", {}).items() if isinstance(value, int)}
+        self._verified[stage, key] = {**found, "scalars": scalars, "stamps": stamps}
+        return self._verified[stage, key], ""
 
     def trust(self, stage: str, receipt: Receipt) -> bool:
         """Accept a receipt that a ledger remembers, if its files are, for the file system, those that were hashed."""
         place = stage, receipt["key"]
         if place not in self._verified:
             base = f"{self.root}/{stage}/{receipt['key'][:2]}/{receipt['key']}"
-            for stamped, suffix in zip(receipt["stamps"], (".json", ".h5"), strict=True):
-                try:
-                    if stamped is not None and stamp(os.stat(base + suffix)) != stamped:
-                        return False
-                except OSError:
+            own, artefact = receipt["stamps"]
+            try:
+                if stamp(os.stat(base + ".json")) != own or (artefact and stamp(os.stat(base + ".h5")) != artefact):
                     return False
+            except OSError:
+                return False
             self._verified[place] = receipt
         return True
 
