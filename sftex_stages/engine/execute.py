@@ -259,7 +259,7 @@ def _parallel(tasks: Iterator[Task], workers: int) -> Iterator[Outcome]:
 
     # joblib runs n_jobs=1 in this process, where a crash would end everything: one task at a time in a pool of two.
     ahead = workers + 1 if workers > 1 else 1
-    with parallel_config("loky", inner_max_num_threads=1, initializer=start):
+    with parallel_config("loky", inner_max_num_threads=1, initializer=start, initargs=(os.getpid(),)):
         parallel = Parallel(
             n_jobs=max(2, workers), return_as="generator_unordered", batch_size=1, pre_dispatch=ahead, max_nbytes=None
         )

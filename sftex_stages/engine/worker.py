@@ -56,16 +56,18 @@ class Outcome:
     log: Path | None = None
 
 
-def start() -> None:
-    """Initialiser of a worker: one thread in OpenCV (joblib's limit does not reach it), no life after the parent."""
+def start(run: int) -> None:
+    """Initialiser of a worker: one thread in OpenCV (joblib's limit does not reach it), no life after the run's process.
+
+    `run` is that process's number: it may have been killed before this is called, and the parent is then another.
+    """
     try:
         importlib.import_module("cv2").setNumThreads(1)
     except ImportError:  # pipelines without vision
         pass
-    parent = os.getppid()
 
     def follow() -> None:
-        while os.getppid() == parent:
+        while os.getppid() == run:
             time.sleep(1.0)
         os._exit(1)  # the run was killed: nobody will read what is computed here
 
