@@ -8,7 +8,8 @@ results change::
     python tests/fingerprints.py                                 shows what is not stated yet
 
 Recorded is a hash of the syntax tree (comments, docstrings and layout do not count) of every module that the stage's
-module imports from sftex_stages, but for the engine, the errors, the configuration and the reading of files `outputs` are the results' files.
+module imports from sftex_stages, but for the engine, the errors, the configuration and the reading of files (these do
+not decide what a result is).
 """
 
 from __future__ import annotations
