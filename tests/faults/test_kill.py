@@ -36,7 +36,7 @@ def test_killed_at_random_moments(folder, log, clean, rng, measured, stage):
             os.killpg(process.pid, signal.SIGKILL)
         else:
             process.kill()
-        process.communicate()
+        process.communicate(timeout=60)
         check(folder, out, clean, **PARAMS)
     measured(
         f"kill −9 in stage {STAGES.index(stage) + 1} of 5, then rerun", times, "equal to a clean run, byte for byte"
@@ -71,7 +71,7 @@ def test_a_run_killed_among_others_holds_nobody_up(folder, log, clean, measured,
         processes = [launch(folder, out, **PARAMS) for _ in range(survivors + 1)]
         assert wait_until(lambda: any(p.name.startswith("part") for p in log.iterdir()))
         os.killpg(processes[0].pid, signal.SIGKILL)
-        processes[0].communicate()
+        processes[0].communicate(timeout=60)
         for process in processes[1:]:
             answer, errors = process.communicate(timeout=300)
             assert process.returncode == 0 and json.loads(answer) == {"a": "", "b": ""}, errors
