@@ -1,4 +1,4 @@
-"""The command line: ``sftex run | plan | status | explain | evaluate | config``, and those of `storage`.
+"""The command line: ``sftex run | plan | status | explain | evaluate | render | config``, and those of `storage`.
 
 Exit codes: 0 success, 1 a defect in sftex, 2 bad configuration or usage (nothing was computed), 3 some images failed
 and the others were delivered, 4 every image failed, 130 interrupted. Results go to stdout, the rest to stderr.
@@ -12,10 +12,11 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import __version__, storage
+from . import __version__, dressing, storage
 from .errors import InputError, SftexError, StoreError
 
 if TYPE_CHECKING:
@@ -227,6 +228,8 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("result", type=Path, metavar="RESULT", help="result.h5, or the folder that holds it")
     evaluate.add_argument("truth", type=Path, metavar="TRUTH", help="truth file (HDF5)")
     evaluate.add_argument("--json", action="store_true", help="print one JSON document")
+
+    dressing.add_parser(partial(_command, commands))
 
     config = _command(commands, "config", _config, "print the complete configuration, with comments")
     config.add_argument("--config", type=Path, metavar="FILE", help="complete this file instead of the defaults")

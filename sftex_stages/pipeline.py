@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import cluster, config, detect, frontal, images, irradiance, surface
+from . import chart, cluster, config, detect, frontal, images, irradiance, surface
 from .engine.plan import Delivery, Item, Plan, Planner
 from .engine.stage import Arrays, Stage
 from .engine.store import Store, read_receipt
@@ -14,7 +14,7 @@ from .errors import StoreError
 from .results import VERSION as RESULTS_VERSION
 
 PIPELINE: tuple[Stage, ...] = (
-    images.STAGE, detect.STAGE, cluster.STAGE, frontal.STAGE, surface.STAGE, irradiance.STAGE,
+    images.STAGE, detect.STAGE, cluster.STAGE, frontal.STAGE, surface.STAGE, irradiance.STAGE, chart.STAGE,
 )  # fmt: skip
 
 
@@ -35,7 +35,7 @@ def planner(
     def meta(item: Item, plan: Plan) -> dict[str, Any]:
         return describe(item, plan, text)
 
-    delivery = Delivery(RESULTS_VERSION, deliver, ("image", "frontal", "surface", "irradiance"), out, meta)
+    delivery = Delivery(RESULTS_VERSION, deliver, ("image", "frontal", "surface", "irradiance", "chart"), out, meta)
     whole = until in (None, delivery.name)
     stages = PIPELINE if whole else needed(until)
     return Planner(stages, params, Store(out / ".store"), delivery if whole else None, repair, frozenset(force))

@@ -46,8 +46,8 @@ def test_run_tells_everything_and_the_second_run_is_cached(here, sftex):
     assert code == cli.OK
     head, *rows = out.splitlines()[:4]
     assert head.split() == [
-        "image", "image", "detect", "cluster", "frontal", "surface", "irradiance", "outputs", "instances", "textons",
-        "files",
+        "image", "image", "detect", "cluster", "frontal", "surface", "irradiance", "chart", "outputs", "instances",
+        "textons", "files",
     ]  # fmt: skip
     assert [row.split()[0] for row in rows] == ["a", "b", "c"]
     assert "(3 of 3)" in rows[0] and rows[0].split()[-5:] == ["27", "2", "of", "3", "1"]
@@ -55,7 +55,7 @@ def test_run_tells_everything_and_the_second_run_is_cached(here, sftex):
     assert (here / "outputs" / "a" / "result.h5").exists()
     code, out, err = sftex("run", "in")
     assert code == cli.OK
-    assert out.splitlines()[1].split()[1:8] == ["cached"] * 7
+    assert out.splitlines()[1].split()[1:9] == ["cached"] * 8
     assert "a: up to date" in err and "again" not in out
 
 
@@ -65,7 +65,7 @@ def test_edited_parameter_is_the_reason(here, sftex):
     code, out, _ = sftex("run", "in/a.png", "--out", "o", "--json")
     document = json.loads(out)
     assert code == document["exit_code"] == cli.OK
-    computed = ["frontal", "surface", "irradiance", "outputs"]
+    computed = ["frontal", "surface", "irradiance", "chart", "outputs"]
     assert states(document) == {
         **dict.fromkeys(["image", "detect", "cluster"], "cached"), **dict.fromkeys(computed, "computed"),
     }  # fmt: skip
@@ -87,7 +87,7 @@ def test_status_before_during_and_after(here, sftex):
     assert entry["surface"] == {"state": "waiting", "waits_for": "image", "expected_jobs": None, "reasons": []}
     sftex("run", "in/a.png")
     _, out, _ = sftex("status", "in/a.png")
-    assert out.splitlines()[1].split() == "a cached cached cached cached (3) cached cached cached".split()
+    assert out.splitlines()[1].split() == "a cached cached cached cached (3) cached cached cached cached".split()
     (here / "pipeline.yaml").write_text("frontal:\n  tol: 1e-7\n")
     _, out, _ = sftex("status", "in/a.png", "in/none.png")
     assert "3 of 3 to run" in out and "after frontal" in out and "frontal.tol 1e-06 → 1e-07" in out

@@ -17,7 +17,7 @@ def surface_of(n=600, noise=0.0, seed=0):
     valid = np.zeros(SHAPE, bool)
     valid[10:-10, 10:-10] = True
     arrays = {
-        "valid": valid,
+        "piece": valid.astype(np.int32),
         "instance/xy": xy.astype(np.float32),
         "instance/irradiance": light.astype(np.float32),
         "instance/irradiance_sigma": np.full(n, 0.003, np.float32),
@@ -44,15 +44,15 @@ def test_exact_data_give_map_and_scales():
     assert np.quantile(log_error(out), 0.99) < 0.01
     found = out["class_scale"] / out["class_scale"][0]
     assert np.isnan(found[2]) and np.allclose(found[[0, 1, 3]], scale[[0, 1, 3]], rtol=0.005)
-    assert np.array_equal(np.isfinite(out["map"]), surface["valid"])
-    assert abs(np.log(out["map"][surface["valid"]]).mean()) < 1e-5
+    assert np.array_equal(np.isfinite(out["map"]), (surface["piece"] > 0))
+    assert abs(np.log(out["map"][(surface["piece"] > 0)]).mean()) < 1e-5
 
 
 def test_instances_are_put_on_the_maps_scale():
     surface, _ = surface_of()
     out = irradiance.run({"surface": surface}, irradiance.Params())
     at = np.rint(surface["instance/xy"]).astype(int)
-    inside = surface["valid"][at[:, 1], at[:, 0]]
+    inside = (surface["piece"] > 0)[at[:, 1], at[:, 0]]
     ratio = out["instance/irradiance"][inside] / out["map"][at[inside, 1], at[inside, 0]]
     assert np.abs(np.log(ratio)).max() < 0.05
 
@@ -71,3 +71,33 @@ def test_too_few_instances():
     surface["instance/inlier"][2:] = 0.1
     with pytest.raises(StageError, match="only 2 instances"):
         irradiance.run({"surface": surface}, irradiance.Params())
+
+
+def test_pieces_share_scales_and_no_light():
+    surface, scale = surface_of(900, noise=0.01, seed=2)
+    right = surface["instance/xy"][:, 0] >= 160
+    surface["instance/irradiance"][right] *= 3  # another light begins behind the gap
+    surface["piece"][:, 155:166] = 0
+    surface["piece"][:, 166:] *= 2
+    out = irradiance.run({"surface": surface}, irradiance.Params())
+    step = np.where(np.arange(SHAPE[1]) < 160, 1.0, 3.0)
+    rows, columns = np.nonzero(surface["piece"])
+    log = np.log(out["map"][rows, columns] / (field(columns, rows) * step[columns]))
+    near = np.abs(columns - 160) < 12  # where one field for both would be smeared
+    assert np.abs(log - np.median(log))[near].max() < 0.05
+    found = out["class_scale"] / out["class_scale"][0]
+    assert np.allclose(found[[1, 3]], scale[[1, 3]], rtol=0.02)
+
+
+def test_sigma_tells_where_the_light_is_known():
+    surface, _ = surface_of(900, noise=0.03, seed=3)
+    alone = surface["instance/xy"][:, 0] > 220
+    surface["instance/inlier"][alone & (np.arange(900) % 8 > 0)] = 0  # an eighth of them is believed there
+    out = irradiance.run({"surface": surface}, irradiance.Params())
+    assert np.array_equal(np.isfinite(out["sigma"]), surface["piece"] > 0)
+    left, right = out["sigma"][20:-20, 20:180], out["sigma"][20:-20, 240:-20]
+    assert np.median(right) > 1.3 * np.median(left)
+    y, x = np.nonzero(surface["piece"])
+    ratio = np.log(out["map"][y, x] / field(x, y))
+    ratio = np.abs(ratio - np.median(ratio)) / out["sigma"][y, x]
+    assert 0.3 < np.median(ratio) < 1.5 and (ratio > 4).mean() < 0.05

@@ -18,7 +18,7 @@ from sftex_stages import cli, pipeline, storage
 from sftex_stages.engine import keys
 
 pytestmark = pytest.mark.usefixtures("here")
-ALL = ["image", "detect", "cluster", "frontal", "surface", "irradiance", "outputs"]
+ALL = ["image", "detect", "cluster", "frontal", "surface", "irradiance", "chart", "outputs"]
 
 
 @pytest.fixture
@@ -152,8 +152,8 @@ def test_gc_keeps_current_and_pinned_and_tells_before_it_removes(here, sftex, do
     assert json.loads(sftex("gc", "--json")[1])["jobs"] == []  # nothing is old enough
     _, out, _ = sftex("gc", "--older-than", "0", "--json")
     document = json.loads(out)
-    assert {job["stage"] for job in document["jobs"]} == {"frontal", "surface", "irradiance", "outputs"}
-    assert len(document["jobs"]) == 6 and files(here / "outputs") == before and not document["deleted"]
+    assert {job["stage"] for job in document["jobs"]} == {"frontal", "surface", "irradiance", "chart", "outputs"}
+    assert len(document["jobs"]) == 7 and files(here / "outputs") == before and not document["deleted"]
     assert len(json.loads(sftex("gc", "--older-than", "0", "--max-size", "1G", "--json")[1])["jobs"]) == 0
     limit = str(document["bytes"] - 1)
     assert len(json.loads(sftex("gc", "--older-than", "0", "--max-size", limit, "--json")[1])["jobs"]) == 1
@@ -312,4 +312,4 @@ def test_sizes_and_ages():
 def test_needed_stages(monkeypatch):
     monkeypatch.setattr(pipeline, "PIPELINE", toy_stages.PIPELINE)
     assert [s.name for s in pipeline.needed("cluster")] == ["image", "detect", "cluster"]
-    assert [s.name for s in pipeline.needed("irradiance")] == ALL[:-1]
+    assert [s.name for s in pipeline.needed("irradiance")] == ALL[:-2]

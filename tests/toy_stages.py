@@ -1,4 +1,4 @@
-"""Quick stand-ins for the six stages, so that the command line is tested without the hours of vision.
+"""Quick stand-ins for the seven stages, so that the command line is tested without the hours of vision.
 
 The image stage is the real one: bad files must be told apart by the program as it is.
 """
@@ -42,6 +42,10 @@ def irradiance(inputs, params):
     return {"map": inputs["surface"]["instance/xy"].sum(axis=1)}
 
 
+def chart(inputs, params):
+    return {"uv": inputs["surface"]["instance/xy"] * 2}
+
+
 PIPELINE = (
     images.STAGE,
     Stage("detect", 1, Detect, detect, inputs=("image",)),
@@ -49,6 +53,7 @@ PIPELINE = (
     Stage("frontal", 1, Other, frontal, inputs=("image", "detect", "cluster"), fan_out="cluster"),
     Stage("surface", 1, Other, surface, inputs=("image", "frontal")),
     Stage("irradiance", 1, Other, irradiance, inputs=("surface",)),
+    Stage("chart", 1, Other, chart, inputs=("surface",)),
 )
 
 

@@ -21,12 +21,12 @@ from ..errors import InputError
 from ..guarded import Declared, read_hdf5
 
 SCHEMA_NAME = "sftex-result"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 AXES = "x right, y down, z toward the camera; pixel centres at integers"
 
 
 class Entry(NamedTuple):
-    """A dataset: dtype ("U" = UTF-8), axes by letter (H, W image; N instances; K textons; n grid), unit, meaning."""
+    """A dataset: dtype ("U" = UTF-8), axes by letter (H, W image; P pieces; N instances; K textons; n grid), unit, meaning."""
 
     dtype: str
     axes: str
@@ -35,6 +35,8 @@ class Entry(NamedTuple):
 
 
 SCHEMA = {
+    "image/rgb": Entry("f4", "H W 3", "relative", "the photograph, linear, sRGB's primaries, to 12 bits; 1 = its white"),
+    "image/mask": Entry("?", "H W", "1", "False where it is transparent or masked"),
     "surface/height": Entry(
         "f4", "H W", "px", "height toward the camera (perspective: px at the distance f), NaN where unsupported"
     ),
@@ -45,6 +47,10 @@ SCHEMA = {
     "surface/piece": Entry("i4", "H W", "1", "connected piece of valid, from 1; offsets between pieces are guessed; else 0"),
     "surface/normal_sigma": Entry("f4", "H W", "degree", "expected error of the normal"),
     "irradiance/map": Entry("f4", "H W", "relative", "linear irradiance, geometric mean 1 over valid, else NaN"),
+    "irradiance/sigma": Entry("f4", "H W", "1", "expected error of the logarithm of irradiance/map, else NaN"),
+    "chart/uv": Entry("f4", "H W 2", "px", "flat coordinates, each piece's own: px of the surface seen straight on, else NaN"),
+    "chart/angular": Entry("f4", "P 2", "degree", "a piece's distortion of angles: median, 95th percentile over its area"),
+    "chart/area": Entry("f4", "P 2", "1", "a piece's relative distortion of areas: median, 95th percentile over its area"),
     "instances/xy": Entry("f4", "N 2", "px", "centre in the image"),
     "instances/transform": Entry("f4", "N 2 2", "1", "maps frontal px to image px"),
     "instances/normal": Entry("f4", "N 3", "1", "unit normal with its sign resolved"),
@@ -70,18 +76,24 @@ SCHEMA = {
 class Result:
     """What a result.h5 holds, as arrays in memory; `SCHEMA` gives axes, units and meaning of each.
 
-    H × W pixels, N instances, K textons. `instances` and `textons` are keyed by the names after the slash.
+    H × W pixels, P pieces, N instances, K textons. `instances` and `textons` are keyed by the names after the slash.
     `focal_px` and `principal_point` (x, y) are None under an orthographic camera. `attributes` has everything else:
     image_name, image_sha256, config_yaml, keys and versions (these two as dictionaries), schema, schema_version, axes.
     """
 
     path: Path
+    image: np.ndarray  # (H, W, 3) linear
+    mask: np.ndarray  # (H, W) bool
     height: np.ndarray  # (H, W) px
     normals: np.ndarray  # (H, W, 3)
     valid: np.ndarray  # (H, W) bool
     piece: np.ndarray  # (H, W) int32
     normal_sigma: np.ndarray  # (H, W) degrees
     irradiance: np.ndarray  # (H, W) relative
+    irradiance_sigma: np.ndarray  # (H, W) of its logarithm
+    chart: np.ndarray  # (H, W, 2) px
+    chart_angular: np.ndarray  # (P, 2) degrees
+    chart_area: np.ndarray  # (P, 2)
     instances: Mapping[str, np.ndarray]
     textons: Mapping[str, np.ndarray]
     camera: str = "orthographic"
@@ -94,7 +106,7 @@ class Result:
 
 
 def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any]) -> bytes:
-    """The archive's bytes, from the stages' arrays {"frontal": [...], "surface": …, "irradiance": …} and `meta`.
+    """The archive's bytes, from the stages' arrays {"image": …, "frontal": [...], …} and `meta`.
 
     meta: image_name, image_sha256, config_yaml (texts), keys, versions (dictionaries). Equal input gives equal bytes.
     Built in memory, so that a full disk is an ordinary OSError at the write instead of a crash inside of HDF5.
@@ -137,8 +149,10 @@ def _camera(surface: Any) -> dict[str, Any]:
 def _collect(arrays: Mapping[str, Any]) -> Arrays:
     """The schema's datasets from the stages' arrays."""
     surface, irradiance, frontal = arrays["surface"], arrays["irradiance"], arrays["frontal"]
-    data: Arrays = {f"surface/{n}": surface[n] for n in ("height", "normals", "valid", "piece", "normal_sigma")}
-    data["irradiance/map"] = irradiance["map"]
+    data: Arrays = {"image/rgb": _rounded(arrays["image"]["rgb"]), "image/mask": arrays["image"]["mask"]}
+    data |= {f"surface/{n}": surface[n] for n in ("height", "normals", "valid", "piece", "normal_sigma")}
+    data |= {f"irradiance/{n}": irradiance[n] for n in ("map", "sigma")}
+    data |= {f"chart/{n}": arrays["chart"][n] for n in ("uv", "angular", "area")}
     for name in SCHEMA:
         group, _, short = name.partition("/")
         if group == "instances":
@@ -150,6 +164,12 @@ def _collect(arrays: Mapping[str, Any]) -> Arrays:
     scale = irradiance["class_scale"]
     data["textons/class_scale"] = np.pad(scale, (0, max(0, len(frontal) - len(scale))), constant_values=np.nan)
     return data
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """float32 values to 12 significant bits, finer than any picture needs: what is left compresses well."""
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    return ((bits + np.uint32(1 << 11)) & np.uint32(0xFFFFF000)).view(np.float32)
 
 
 def _fits(entry: Entry, shape: tuple[int, ...], sizes: dict[str, int]) -> bool:
@@ -217,7 +237,13 @@ def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
     return Result(
         path=path,
         **{n: data[f"surface/{n}"] for n in ("height", "normals", "valid", "piece", "normal_sigma")},
+        image=data["image/rgb"],
+        mask=data["image/mask"],
         irradiance=data["irradiance/map"],
+        irradiance_sigma=data["irradiance/sigma"],
+        chart=data["chart/uv"],
+        chart_angular=data["chart/angular"],
+        chart_area=data["chart/area"],
         instances={n.partition("/")[2]: a for n, a in data.items() if n.startswith("instances/")},
         textons={n.partition("/")[2]: a for n, a in data.items() if n.startswith("textons/")},
         camera=camera,

@@ -1,8 +1,4 @@
-"""The surface and the maps for other programs: EXR (OpenImageIO), PLY and GLB. Every function returns a file's bytes.
-
-Meshes are in the frame of 3-D viewers: x right, y up, z toward the viewer, that is (x, -y, z) of the image's frame, so
-that the surface stands upright and faces the viewer. Their unit is the pixel.
-"""
+"""The surface and the maps for other programs: EXR (OpenImageIO), PLY, OBJ and GLB. Every function returns a file's bytes."""
 
 from __future__ import annotations
 
@@ -10,40 +6,28 @@ import json
 import struct
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 import OpenImageIO as oiio
 
-from ..errors import StageError, StoreError
-
-MAX_TRIANGLES = 190_000
-MAX_TEXTURE = 2048  # px, longer side; keeps a GLB under 10 MB
-#: A cell of the mesh rising more than this many times its width is a tear between two pieces, not a surface: that slant
-#: of 85° is far beyond what can be measured (the detector itself loses elements near 60°).
-STEEPEST = 12.0
+from ..errors import StoreError
+from .mesh import Mesh
 
 
-class Mesh(NamedTuple):
-    """Triangles in the viewers' frame: vertices (V, 3) px, normals (V, 3), uv (V, 2) in 0…1 from the image's top left
-    corner, faces (F, 3) counter-clockwise seen from the viewer."""
+def usual_exposure(light: np.ndarray) -> float:
+    """What linear light (H, …) is multiplied by to be shown: 1, unless the scene is far from the range 0…1, as EXR may be.
 
-    vertices: np.ndarray
-    normals: np.ndarray
-    uv: np.ndarray
-    faces: np.ndarray
+    Then the 99th percentile is taken to 0.9.
+    """
+    bright = float(np.percentile(light[:: max(1, len(light) // 256)], 99)) if light.size else 1.0
+    return 1.0 if 0.05 < bright <= 1 else 0.9 / max(bright, 1e-12)
 
 
 def to_display(light: np.ndarray, exposure: float | None = None) -> np.ndarray:
-    """Linear light, float32 of any shape, times `exposure`, to sRGB uint8, for pictures.
-
-    Without `exposure` it is 1, unless the scene is far from the range 0…1, as EXR may be: then the 99th percentile is
-    taken to 0.9.
-    """
+    """Linear light, float32 of any shape, times `exposure` (default: its `usual_exposure`), to sRGB uint8, for pictures."""
     if exposure is None:
-        bright = float(np.percentile(light[:: max(1, len(light) // 256)], 99)) if light.size else 1.0
-        exposure = 1.0 if 0.05 < bright <= 1 else 0.9 / max(bright, 1e-12)
+        exposure = usual_exposure(light)
     v = np.clip(light * np.float32(exposure), 0, 1)
     # A table over 16 bits of linear light is finer than 8 bits of sRGB need anywhere but in the darkest two steps.
     return _ENCODE[(v * 65535 + 0.5).astype(np.uint16)]
@@ -66,7 +50,7 @@ def exr(data: np.ndarray, channels: tuple[str, ...], about: str, scratch: Path) 
     spec.attribute("ImageDescription", about)
     spec.attribute("Software", "sftex")
     spec.attribute("DateTime", "1970:01:01 00:00:00")  # else the clock's time: equal data must give equal files
-    spec.attribute("oiio:ColorSpace", "lin_rec709_scene" if channels == ("Y",) else "data")
+    spec.attribute("oiio:ColorSpace", "lin_rec709_scene" if channels[0] in ("Y", "R") else "data")
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
         path = Path(folder) / "x.exr"
         out = oiio.ImageOutput.create(str(path))
@@ -78,54 +62,17 @@ def exr(data: np.ndarray, channels: tuple[str, ...], about: str, scratch: Path) 
         return path.read_bytes()
 
 
-def mesh(height: np.ndarray, normals: np.ndarray, valid: np.ndarray, max_triangles: int = MAX_TRIANGLES) -> Mesh:
-    """Triangulate a height field (H, W) on a regular grid coarse enough for `max_triangles`.
-
-    A cell is filled only if every pixel that it covers is valid: holes stay open and separate pieces are not joined.
-    Raises StageError if no cell is.
-    """
-    h, w = height.shape
-    valid = valid & np.isfinite(height) & np.isfinite(normals).all(axis=2)
-    step = max(1, int(np.ceil(np.sqrt(2 * valid.sum() / max_triangles))))
-    ys = np.arange((h - 1) % step // 2, h, step)
-    xs = np.arange((w - 1) % step // 2, w, step)
-    grid = np.ix_(ys, xs)
-    # Minimum over the (step + 1)² pixels right of and below each corner.
-    filled = cv2.erode(valid.astype(np.uint8), np.ones((step + 1, step + 1), np.uint8), anchor=(0, 0)) > 0
-    z = np.where(valid, height, 0)[grid]
-    corners = np.stack([z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]])
-    cells = filled[grid][:-1, :-1] & (np.ptp(corners, axis=0) <= STEEPEST * step)
-    r, c = np.nonzero(cells)
-    a = r * len(xs) + c  # top left; seen from the viewer, y up, counter-clockwise is down first
-    b, below, d = a + 1, a + len(xs), a + len(xs) + 1
-    faces = np.concatenate([np.stack([a, below, b], 1), np.stack([b, below, d], 1)])
-    if not len(faces):
-        raise StageError(f"the supported surface ({int(valid.sum())} pixels) is too small or too thin for a mesh")
-    here = np.zeros(len(ys) * len(xs), bool)
-    here[faces] = True
-    used, faces = np.flatnonzero(here), (np.cumsum(here) - 1)[faces]
-    y, x = ys[used // len(xs)], xs[used % len(xs)]
-    n = normals[y, x]
-    return Mesh(
-        np.stack([x, -y, height[y, x]], 1).astype(np.float32),
-        (n * np.array([1, -1, 1])).astype(np.float32),
-        np.stack([(x + 0.5) / w, (y + 0.5) / h], 1).astype(np.float32),
-        faces.astype(np.uint32),
-    )
-
-
-def texture(photo: np.ndarray) -> bytes:
-    """The photograph (H, W, 3) uint8 sRGB as a JPEG of at most `MAX_TEXTURE` pixels a side."""
-    scale = MAX_TEXTURE / max(photo.shape[:2])
-    if scale < 1:
-        photo = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", photo[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+def encode(picture: np.ndarray, ending: str) -> bytes:
+    """A picture (h, w, 3 or 4) uint8 sRGB, RGB or RGBA, as a file of the kind ".png" or ".jpg"."""
+    order = [2, 1, 0, 3][: picture.shape[2]]
+    quality = [] if ending == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 92]
+    return cv2.imencode(ending, picture[..., order], quality)[1].tobytes()
 
 
 def ply(surface: Mesh, photo: np.ndarray, texture_name: str) -> bytes:
-    """Binary PLY: position, normal, colour of the photograph (H, W, 3) uint8, coordinates into `texture_name`."""
+    """Binary PLY: position, normal, colour from a picture (H, W, 3) uint8 of the image, coordinates into `texture_name`."""
     h, w = photo.shape[:2]
-    x, y = surface.vertices[:, 0].astype(int), -surface.vertices[:, 1].astype(int)
+    x, y = surface.pixel.T
     vertex = np.zeros(len(surface.vertices), [("p", "<f4", 3), ("n", "<f4", 3), ("rgb", "u1", 3), ("st", "<f4", 2)])
     vertex["p"], vertex["n"], vertex["rgb"] = surface.vertices, surface.normals, photo[y, x]
     vertex["st"] = surface.uv * [1, -1] + [0, 1]  # PLY's readers count t from the bottom
@@ -147,11 +94,37 @@ def ply(surface: Mesh, photo: np.ndarray, texture_name: str) -> bytes:
     return "\n".join([*header, ""]).encode("ascii") + vertex.tobytes() + face.tobytes()
 
 
-def glb(surface: Mesh, jpeg: bytes, size: tuple[int, int], about: str) -> bytes:
-    """Binary glTF 2.0, one mesh with the JPEG as its base colour.
+def obj(surface: Mesh, material_name: str) -> bytes:
+    """Wavefront OBJ: positions, normals and coordinates into the texture of the material "surface" in `material_name`."""
+    st = surface.uv * [1, -1] + [0, 1]  # counted from the bottom
+    number = np.repeat(surface.faces.astype(np.int64) + 1, 3, axis=1)
+    u, v = surface.unit
+    parts = [
+        "# sftex: x right, y up, z toward the viewer; unit: pixel of the photograph\n"
+        f"# texture: the flattened surface, {u:.1f} x {v:.1f} px of it\n"
+        f"mtllib {material_name}\no surface\nusemtl surface\n",
+        _lines("v %.3f %.3f %.3f", surface.vertices),
+        _lines("vt %.6f %.6f", st),
+        _lines("vn %.4f %.4f %.4f", surface.normals),
+        _lines("f %d/%d/%d %d/%d/%d %d/%d/%d", number),
+    ]
+    return "".join(parts).encode("ascii")
+
+
+def _lines(form: str, rows: np.ndarray) -> str:
+    return "\n".join([form] * len(rows)) % tuple(rows.ravel().tolist()) + "\n"
+
+
+def mtl(texture_name: str) -> bytes:
+    """The material of `obj`: matt, its colour from a texture."""
+    return f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture_name}\n".encode("ascii")
+
+
+def glb(surface: Mesh, texture: bytes, size: tuple[int, int], about: str) -> bytes:
+    """Binary glTF 2.0, one mesh with a JPEG, `texture`, as its base colour.
 
     Vertices are in px; the node centres the photograph of `size` (height, width) and makes its longer side 1 unit long,
-    as viewers expect objects of about a metre.
+    as viewers expect objects of about a metre. The asset's extras say how many px of the surface a unit of u and v is.
     """
     views: list[dict] = []
     blob = bytearray()
@@ -176,7 +149,7 @@ def glb(surface: Mesh, jpeg: bytes, size: tuple[int, int], about: str) -> bytes:
     scale = 1 / max(size)
     centre = np.array([(size[1] - 1) / 2, -(size[0] - 1) / 2, float(np.median(surface.vertices[:, 2]))])
     document = {
-        "asset": {"version": "2.0", "generator": "sftex", "extras": {"about": about}},
+        "asset": {"version": "2.0", "generator": "sftex", "extras": {"about": about, "px_per_uv": surface.unit.tolist()}},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "surface", "scale": [scale] * 3, "translation": (-centre * scale).tolist()}],
@@ -191,7 +164,7 @@ def glb(surface: Mesh, jpeg: bytes, size: tuple[int, int], about: str) -> bytes:
         ],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"mimeType": "image/jpeg", "bufferView": view(jpeg)}],
+        "images": [{"mimeType": "image/jpeg", "bufferView": view(texture)}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": len(blob) + -len(blob) % 4}],

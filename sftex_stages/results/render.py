@@ -15,7 +15,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from .exports import STEEPEST, to_display
+from .exports import to_display
+from .mesh import STEEPEST
 
 BACKGROUND = (244, 244, 246)
 SUPERSAMPLING = 2

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sftex_stages.engine.stage import Arrays
+from sftex_stages.geometry.chart import Pinhole, make_chart
 
 H, W = 90, 130
 
@@ -28,6 +29,8 @@ def stage_arrays() -> dict[str, Any]:
     rng = np.random.default_rng(3)
     surface = domes()
     valid = surface["valid"]
+    piece = np.where(valid, np.where(np.arange(W) < 65, 1, 2), 0).astype("i4")
+    flat = make_chart(surface["height"], surface["normals"], piece, Pinhole(), 2000, 40)
     n, sizes = 40, (9, 12, 0)
     iy, ix = (a[rng.permutation(valid.sum())[:n]] for a in np.nonzero(valid))
     normal = surface["normals"][iy, ix]
@@ -58,13 +61,15 @@ def stage_arrays() -> dict[str, Any]:
         "frontal": frontal,
         "surface": surface
         | {"normal_sigma": np.full((H, W), 3, "f4"), "energy": np.array(1.0), "camera": np.array("orthographic")}
-        | {"piece": surface["valid"].astype("i4")}
+        | {"focal_px": np.array(np.inf), "principal_point": np.array([64.5, 44.5]), "piece": piece}
         | {f"instance/{k}": v for k, v in instance.items()},
         "irradiance": {
             "map": light.astype("f4"),
+            "sigma": np.where(valid, 0.02, np.nan).astype("f4"),
             "class_scale": np.array([1, np.nan, np.nan], "f4"),
             "instance/irradiance": np.full(n, 1.25, "f4"),
         },
+        "chart": {"uv": flat.uv.astype("f4"), "angular": flat.angular.astype("f4"), "area": flat.area.astype("f4")},
     }
 
 

@@ -28,6 +28,11 @@ def test_round_trip(path: Path, arrays: dict, meta: dict) -> None:
         np.testing.assert_array_equal(getattr(result, name), surface[name])
         assert getattr(result, name).dtype == surface[name].dtype
     np.testing.assert_array_equal(result.irradiance, arrays["irradiance"]["map"])
+    np.testing.assert_array_equal(result.irradiance_sigma, arrays["irradiance"]["sigma"])
+    for name, part in (("chart", "uv"), ("chart_angular", "angular"), ("chart_area", "area")):
+        np.testing.assert_array_equal(getattr(result, name), arrays["chart"][part])
+    np.testing.assert_allclose(result.image, arrays["image"]["rgb"], rtol=2**-12)  # half a unit of the twelfth bit
+    np.testing.assert_array_equal(result.mask, arrays["image"]["mask"])
     for name in ("xy", "transform", "normal", "inlier", "texton", "normal_sigma", "state", "irradiance_sigma"):
         np.testing.assert_array_equal(result.instances[name], surface[f"instance/{name}"])
     assert (result.instances["irradiance"] == 1.25).all()  # on the common scale, not each texton's own
@@ -45,7 +50,7 @@ def test_round_trip(path: Path, arrays: dict, meta: dict) -> None:
 
 def test_h5py_alone_understands_it(path: Path) -> None:
     with h5py.File(path) as file:
-        assert file.attrs["schema"] == "sftex-result" and file.attrs["schema_version"] == 1
+        assert file.attrs["schema"] == "sftex-result" and file.attrs["schema_version"] == 2
         assert file.attrs["axes"] == "x right, y down, z toward the camera; pixel centres at integers"
         assert file.attrs["camera"] == "orthographic"
         found = []
@@ -118,12 +123,14 @@ def _virtual(file: h5py.File, folder: Path) -> None:
 
 
 def _huge(file: h5py.File, folder: Path) -> None:
-    for name in [n for n in archive.SCHEMA if n.startswith(("surface/", "irradiance/")) and n in file]:
+    pixels = [n for n, entry in archive.SCHEMA.items() if entry.axes.startswith("H W")]
+    for name in [n for n in pixels if n in file]:
         del file[name]
-    for name, entry in archive.SCHEMA.items():
-        if name.startswith(("surface/", "irradiance/")):
-            shape = (10**6, 10**6, 3)[: len(entry.axes.split())]
-            file.create_dataset(name, shape, entry.dtype, chunks=(1000, 1000, 3)[: len(shape)])
+    for name in pixels:
+        entry = archive.SCHEMA[name]
+        axes = entry.axes.split()
+        shape = (10**6, 10**6, *map(int, axes[2:]))
+        file.create_dataset(name, shape, entry.dtype, chunks=(1000, 1000, *map(int, axes[2:])))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +143,7 @@ def _huge(file: h5py.File, folder: Path) -> None:
         (_replace("surface/height", _virtual), "not an ordinary dataset"),
         (_replace("surface/height", _huge), r"declares \d+\.\d GiB"),
         (_replace("surface/height", lambda f, d: None), "surface/height is missing"),
-        (_replace("surface/height", lambda f, d: np.zeros((90, 131), "f4")), r"surface/normals is .* W = 131"),
+        (_replace("surface/height", lambda f, d: np.zeros((90, 131), "f4")), r"surface/height is .* W = 130"),
         (_replace("instances/xy", lambda f, d: np.zeros((40, 3), "f4")), r"instances/xy .* axes N 2"),
         (_replace("surface/valid", lambda f, d: np.zeros((90, 130), "c8")), "surface/valid is complex64"),
     ],
