@@ -1,14 +1,16 @@
 """HDF5 files from others, read where a crash, a hang or a bomb does no harm: in a child process.
 
-The child opens the file without locks and may not write any file. It takes nothing but plain datasets of this one file:
-soft and external links, external storage and virtual datasets are refused, and so is, before any of it is read, more
-data than allowed or than the file's bytes can hold. One child serves many files and ends with its parent.
+It opens the file without locks and may not write any file. It takes nothing but plain datasets of this one file: soft
+and external links, external storage and virtual datasets are refused, and so is, before any of it is read, more data
+than allowed or than the file's bytes can hold. A server that ends with its parent has the libraries loaded and forks a
+child for every file, so that no file meets what another one left behind.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import importlib
 import json
 import os
 import selectors
@@ -25,6 +27,7 @@ import numpy as np
 from .errors import InputError
 
 PATIENCE = 6.0  # seconds without a byte from the child
+_MOST_SECONDS = 600  # of work on one file, should nobody be left to lose patience
 _SLAB = 16 << 20  # bytes sent at a time
 _MOST_HEADER = 64 << 20
 _FAILED = (1 << 64) - 1  # in place of a slab's length
@@ -59,39 +62,37 @@ def read_hdf5(
     if not path.is_file():
         raise InputError(f"{path}: no such {what} file")
     with _lock:
-        child = _running()
+        server = _running()
         try:
-            found = child.read(path, names, max_bytes, check)
+            return server.read(path, names, max_bytes, check)
         except DamagedFileError as error:
-            child.kill()
             raise InputError(f"{path}: not a whole {what} file in HDF5 ({error}); make or copy it anew") from error
-        except BaseException:
-            child.kill()  # whatever is left of this file goes with it
-            raise
-    return found
+        finally:
+            if not server.idle:
+                server.kill()  # whatever is left of this file goes with it
 
 
 # ----------------------------------------------------------------------------------------------- the parent's side
 
 _lock = threading.Lock()
-_child: _Child | None = None
+_server: _Server | None = None
 
 
-class _Child:
-    """A running child. After an error it is not used again."""
+class _Server:
+    """A running server. It is used again only while it is idle: all that was asked of it, it has answered."""
 
     def __init__(self) -> None:
         folder = str(Path(__file__).resolve().parents[1])
         known = os.environ.get("PYTHONPATH")
-        env = {**os.environ, "PYTHONPATH": folder + (os.pathsep + known if known else "")}
+        env = {**os.environ, "PYTHONPATH": folder + (os.pathsep + known if known else ""), "OMP_NUM_THREADS": "1"}
         self.owner = os.getpid()
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-m", __name__], env=env,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, process_group=0,
         )  # fmt: skip
         assert self.process.stdin and self.process.stdout
         self.to: IO[bytes] = self.process.stdin
-        self.start = True
+        self.idle, self.new = True, True
         self.out = self.process.stdout.fileno()
         self.selector = selectors.DefaultSelector()
         self.selector.register(self.out, selectors.EVENT_READ)
@@ -100,18 +101,28 @@ class _Child:
         self, path: Path, names: Sequence[str], max_bytes: int, check: Check | None
     ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         request = {"path": str(path.absolute()), "names": list(names), "max_bytes": max_bytes}
+        self.idle = False
         try:
-            self.to.write(json.dumps(request).encode() + b"\n")
-            self.to.flush()
-            header = self._json(path, 5 * PATIENCE if self.start else PATIENCE)  # the first one waits for imports
-            self.start = False
+            self._say(json.dumps(request).encode() + b"\n")
+            header = self._json(path)
             declared = {name: Declared(dtype, tuple(shape)) for name, dtype, shape in header["declared"]}
             if check:
-                check(header["attributes"], declared)
+                try:
+                    check(header["attributes"], declared)
+                except InputError:
+                    self._say(b"-")
+                    self._json(path)
+                    raise
+            self._say(b"+")
             arrays = {name: self._array(path, *entry) for name, entry in declared.items()}
+            self._json(path)
         except (BrokenPipeError, EOFError) as error:
             raise DamagedFileError(f"reading it crashed, {self._ending()}") from error
         return header["attributes"], arrays
+
+    def _say(self, words: bytes) -> None:
+        self.to.write(words)
+        self.to.flush()
 
     def _array(self, path: Path, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
         if dtype == "U":
@@ -120,26 +131,28 @@ class _Child:
         view = memoryview(array.reshape(-1).view(np.uint8).data)
         at = 0
         while at < len(view):
-            length = int.from_bytes(self._bytes(path, 8), "little")
+            length = int.from_bytes(self._bytes(8), "little")
             if length == _FAILED:
                 self._json(path)
-            view[at : at + length] = self._bytes(path, length)
+            view[at : at + length] = self._bytes(length)
             at += length
         return array
 
-    def _json(self, path: Path, patience: float = PATIENCE) -> dict[str, Any]:
-        length = int.from_bytes(self._bytes(path, 8, patience), "little")
+    def _json(self, path: Path) -> dict[str, Any]:
+        length = int.from_bytes(self._bytes(8), "little")
         if length > _MOST_HEADER:
             raise DamagedFileError(f"{length} bytes of attributes or text")
-        document: dict[str, Any] = json.loads(self._bytes(path, length))
+        document: dict[str, Any] = json.loads(self._bytes(length))
+        self.idle = not document.keys().isdisjoint({"refused", "damaged", "end"})  # these are its last words
         if "refused" in document:
             raise InputError(f"{path}: {document['refused']}")
         if "damaged" in document:
             raise DamagedFileError(document["damaged"])
         return document
 
-    def _bytes(self, path: Path, count: int, patience: float = PATIENCE) -> bytes:
+    def _bytes(self, count: int) -> bytes:
         blocks = []
+        patience = 5 * PATIENCE if self.new else PATIENCE  # the first answer waits for imports
         while count:
             if not self.selector.select(patience):
                 raise DamagedFileError(f"no answer within {patience:.0f} s")
@@ -148,6 +161,7 @@ class _Child:
                 raise EOFError
             blocks.append(block)
             count -= len(block)
+            self.new = False
         return b"".join(blocks)
 
     def _ending(self) -> str:
@@ -155,54 +169,72 @@ class _Child:
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
     def kill(self) -> None:
-        """End the child."""
-        global _child
-        _child = None
+        """End it, and its child."""
+        global _server
+        _server = None
         self.selector.close()
-        self.process.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
         with contextlib.suppress(BrokenPipeError):
             self.process.communicate()
 
 
-def _running() -> _Child:
-    global _child
-    if _child is None or _child.owner != os.getpid() or _child.process.poll() is not None:
-        _child = _Child()
-    return _child
+def _running() -> _Server:
+    global _server
+    if _server is None or _server.owner != os.getpid() or _server.process.poll() is not None:
+        _server = _Server()
+    return _server
 
 
 @atexit.register
 def _stop() -> None:
-    if _child and _child.owner == os.getpid():
-        _child.kill()
+    if _server and _server.owner == os.getpid():
+        _server.kill()
 
 
-# ------------------------------------------------------------------------------------------------ the child's side
+# ------------------------------------------------------------------------------------------------ the server's side
 
 
 def _serve() -> None:
-    """Answer requests until the parent is gone."""
+    """Answer requests, each in a child, until the parent is gone; die as a child dies."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))  # a file that makes HDF5 write has no effect
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # nothing else may print into the answers
-    import h5py
-
-    h5py.get_config()
+    importlib.import_module(".engine.hdf5", __package__)  # h5py and all it needs: loaded once, before the forks
     for line in sys.stdin.buffer:
-        request = json.loads(line)
-        room = request["max_bytes"] + (2 << 30)
-        resource.setrlimit(resource.RLIMIT_AS, (room, resource.getrlimit(resource.RLIMIT_AS)[1]))
-        try:
-            for block in _answer(request):
-                out.write(block)
-        except Refused as error:
-            _fail(out, "refused", str(error))
-        except Exception as error:
-            _fail(out, "damaged", " ".join(str(error).split())[:300] or type(error).__name__)
-        out.flush()
+        child = os.fork()
+        if child == 0:
+            try:
+                _reply(json.loads(line), out)
+                os._exit(0)
+            finally:
+                os._exit(1)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if code < 0:
+            os.kill(os.getpid(), -code)
+        if code:
+            os._exit(max(code, 1))
+
+
+def _reply(request: dict[str, Any], out: IO[bytes]) -> None:
+    """The answer to one request, in the child."""
+    import resource
+
+    room = request["max_bytes"] + (2 << 30)
+    resource.setrlimit(resource.RLIMIT_AS, (room, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    resource.setrlimit(resource.RLIMIT_CPU, (_MOST_SECONDS, _MOST_SECONDS))
+    try:
+        for block in _answer(request):
+            out.write(block)
+            out.flush()
+    except Refused as error:
+        _fail(out, "refused", str(error))
+    except Exception as error:
+        _fail(out, "damaged", " ".join(str(error).split())[:300] or type(error).__name__)
+    out.flush()
 
 
 def _fail(out: IO[bytes], how: str, words: str) -> None:
@@ -241,7 +273,7 @@ def _answer(request: dict[str, Any]) -> Iterator[bytes]:
         declared = [[name, _dtype(name, node), list(node.shape)] for name, node in found.items()]
         attributes = {str(name): _plain_value(file.attrs, name) for name in file.attrs}
         yield from _framed({"attributes": attributes, "declared": declared})
-        for name, node in found.items():
+        for name, node in found.items() if os.read(0, 1) == b"+" else ():
             if _dtype(name, node) == "U":
                 _fail_as_slab[0] = False
                 text = np.asarray(node.asstr()[()], dtype=np.str_)
@@ -254,6 +286,7 @@ def _answer(request: dict[str, Any]) -> Iterator[bytes]:
                     yield len(data).to_bytes(8, "little")
                     yield data
         _fail_as_slab[0] = False
+    yield from _framed({"end": True})  # not before the file is closed, which may fail too
 
 
 def _dataset(file: Any, name: str) -> Any:

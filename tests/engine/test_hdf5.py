@@ -53,7 +53,8 @@ def test_bytes_depend_on_the_content_alone():
     assert encode(other) == image
     code = "import test_hdf5 as t, hashlib; print(hashlib.sha256(t.encode(t.arrays())).hexdigest())"
     paths = json.dumps([*sys.path, __file__.rsplit("/", 1)[0]])
-    done = subprocess.run([sys.executable, "-c", f"import sys; sys.path[:] = {paths}; {code}"], capture_output=True)
+    code = f"import sys; sys.path[:] = {paths}; {code}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120)
     assert done.stdout.decode().strip() == hashlib.sha256(image).hexdigest(), done.stderr.decode()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from sftex_stages.engine.store import Store
 HERE = Path(__file__).parent
 ENGINE = HERE.parent / "engine"
 LONG = os.environ.get("SFTEX_FAULTS") == "long"
+HANG = 10.0 if LONG else 60.0  # seconds; the short set runs beside other work
 
 
 def results(out):
@@ -42,6 +44,15 @@ def launch(folder, out, *names, seconds=0.0, preexec=None, **params):
         [sys.executable, str(HERE / "fault_driver.py"), job], cwd=folder, env={**os.environ, "PYTHONPATH": path},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=preexec,
     )  # fmt: skip
+
+
+def said(process, seconds=300.0):
+    """What a launched run printed, and its errors; one that hangs is ended with all its workers."""
+    try:
+        return process.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
 
 
 def wait_until(condition, seconds=60.0):

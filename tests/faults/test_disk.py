@@ -12,7 +12,7 @@ import subprocess
 
 import pytest
 import toy_pipeline as toy
-from faults import LONG, check, launch, results
+from faults import LONG, check, launch, results, said
 
 from sftex_stages.engine import runs, worker
 from sftex_stages.errors import SftexError
@@ -138,7 +138,7 @@ def test_files_cannot_grow(folder, measured, limit):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = launch(folder, folder / "out", preexec=limited)
-    answer, errors = process.communicate(timeout=120)
+    answer, errors = said(process)
     assert process.returncode in (0, 2), errors
     words = [error for error in json.loads(answer).values() if error]
     assert words and all("cannot be written (File too large)" in error for error in words), words
@@ -150,10 +150,13 @@ def test_files_cannot_grow(folder, measured, limit):
 def mounted(path, kind, *options):
     """Mount for one test, if that is permitted here; a function that undoes it."""
     path.mkdir(exist_ok=True)
-    done = subprocess.run(["mount", *options, *kind, str(path)], capture_output=True) if os.geteuid() == 0 else None
-    if done is None or done.returncode:
+    if os.geteuid() or call("mount", *options, *kind, path, check=False):
         pytest.skip("mounting is not permitted here")
-    return lambda: subprocess.run(["umount", "-l", str(path)], check=True)
+    return lambda: call("umount", "-l", path)
+
+
+def call(*words, check=True):
+    return subprocess.run([str(word) for word in words], check=check, capture_output=True, timeout=60).returncode
 
 
 @pytest.mark.skipif(not LONG, reason="long set: make faults")
@@ -167,12 +170,12 @@ def test_full_disk(folder, measured):
         undo = mounted(out, ["tmpfs"], "-t", "tmpfs", "-o", f"size={kilobytes}k")
         try:
             process = launch(folder, out)
-            answer, errors = process.communicate(timeout=120)
+            answer, errors = said(process)
             assert process.returncode in (0, 2), errors
             words = [error for error in json.loads(answer).values() if error]
             assert all("No space left on device" in error for error in words), words
             loud += bool(words)
-            subprocess.run(["mount", "-o", "remount,size=10m", str(out)], check=True)
+            call("mount", "-o", "remount,size=10m", out)
             check(folder, out, expected)
             cases += 1
         finally:
@@ -218,7 +221,7 @@ def test_mounted_read_only(folder, measured):
     before = results(folder / "out")
     undo = mounted(folder / "out", [str(folder / "out")], "--bind")
     try:
-        subprocess.run(["mount", "-o", "remount,ro,bind", str(folder / "out")], check=True)
+        call("mount", "-o", "remount,ro,bind", folder / "out")
         found, _ = run(folder, "a.txt")
         assert not found["a"].error
         with pytest.raises(SftexError, match="Read-only file system"):

@@ -18,7 +18,7 @@ def reconstruct(folder, out, jobs):
     """The JSON of a run of the whole pipeline."""
     command = [sys.executable, "-m", "sftex_stages.cli", "run", "in", "--out", out, "--jobs", str(jobs), "--json"]
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=3000)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
