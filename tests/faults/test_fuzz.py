@@ -6,6 +6,7 @@ import signal
 import struct
 import time
 import zlib
+from collections import defaultdict
 from pathlib import Path
 
 import h5py
@@ -14,7 +15,7 @@ import OpenImageIO as oiio
 import pytest
 from faults import HANG, LONG, wait_until
 
-from sftex_stages import evaluate, guarded, images, pipeline
+from sftex_stages import cli, evaluate, guarded, images, pipeline
 from sftex_stages.engine.execute import execute
 from sftex_stages.errors import InputError
 from sftex_stages.results import archive
@@ -49,7 +50,7 @@ def mutations(content, rng, times):
 def result_files(folder):
     """A result as sftex writes it, and one as plain h5py does (whose metadata have no checksums)."""
     rng = np.random.default_rng(0)
-    data, sizes = {}, {"H": 40, "W": 50, "N": 9, "K": 2, "n": 6}
+    data, sizes = {}, defaultdict(lambda: 3, {"H": 40, "W": 50, "N": 9, "K": 2, "n": 6})
     for name, entry in archive.SCHEMA.items():
         shape = tuple(int(a) if a.isdigit() else sizes[a] for a in entry.axes.split())
         data[name] = np.full(shape, "word", "S8") if entry.dtype == "U" else rng.random(shape).astype(entry.dtype)
@@ -66,7 +67,7 @@ def result_files(folder):
 
 
 def listing(*folders):
-    return {p: p.stat().st_mtime_ns for folder in folders for p in folder.rglob("*") if p.name != "fuzzed.h5"}
+    return {p: p.stat().st_mtime_ns for folder in folders for p in folder.rglob("*") if not p.name.startswith("fuzzed.")}
 
 
 def test_fuzzed_results(tmp_path, monkeypatch, rng, measured):
@@ -83,6 +84,9 @@ def test_fuzzed_results(tmp_path, monkeypatch, rng, measured):
             try:
                 archive.open_result(path) if number % 3 else evaluate.evaluate(tmp_path / "sealed.h5", path)
                 counts["read"] += 1
+                if number % 3:
+                    shown = tmp_path / f"fuzzed.{'png' if number % 2 else 'exr'}"
+                    assert cli.main(["render", str(path), "--light", "1,-1,2", "-o", str(shown)]) in (cli.OK, cli.USAGE)
             except InputError as error:
                 assert str(path) in str(error) or "sealed.h5" in str(error)
                 counts["crashed" if "reading it crashed" in str(error) else "refused"] += 1
