@@ -19,7 +19,7 @@ from .geometry.metric import (
     project_tensors,
     turn_variance,
 )
-from .geometry.registration import patch_grid, register, sample
+from .geometry.registration import channel_gains, patch_grid, register, sample
 from .geometry.texton import (
     Estimate,
     Settings,
@@ -49,16 +49,31 @@ class Params(StageParams):
     iterations: int = Field(20, ge=5, le=100, description="EM iterations")
     affine_iterations: int = Field(6, ge=1, le=50, description="of which with free affine frames")
     subset: int = Field(200, ge=3, description="instances that found the texton; the others are registered to it")
+    adopt: float = Field(
+        0.95, ge=0, le=1, description="other points are tried whose descriptor is as near as this share of the own"
+    )
     agreement: float = Field(0.3, gt=0, lt=1, description="share of unrelated variance below which a pixel is the element's")
     noise_floor: float = Field(0.01, gt=0, lt=1, description="texton noise that no agreement undercuts, in units of contrast")
+    blur: float = Field(0.5, ge=0, le=5, description="standard deviation of the image's point spread, px")
+    fit_blur: bool = Field(True, description="whether each texton finds the point spread itself, starting from `blur`")
     trend_order: int = Field(1, ge=0, le=2, description="order of the polynomial trend of log scale (perspective)")
     max_metric_residual: float = Field(0.03, gt=0, description="a texton above is unusable")
-    max_metric_error: float = Field(0.1, gt=0, description="a texton whose stretch is known less well is unusable")
+    min_share: float = Field(0.3, ge=0, le=1, description="share of the members (or 20 of them) that must agree with a texton")
+    max_metric_error: float = Field(0.07, gt=0, description="a texton whose stretch is known less well is unusable")
     max_sigma: float = Field(8.0, gt=0, description="a texton whose typical normal error is larger (degrees) is unusable")
 
 
+_ENOUGH = 20  # instances that chance does not bring together, however large their cluster
 _CIRCLE_SLACK = 4.0  # one size is all that a circle's upgrade fits, so that scattered sizes say less against it
 _MEMO: dict[Any, Any] = {}  # the pyramid of the image in hand, shared by the jobs that one worker runs
+
+
+def sampling_spread(factor: float) -> float:
+    """Variance of the point spread that a pyramid level and its sampling add, in px² of the level; `factor` its scale.
+
+    Halving averages over boxes as wide as the new pixels; bilinear sampling, on average over subpixel positions, adds 1/6.
+    """
+    return max(1 - factor**2, 0) / 12 + 1 / 6
 
 
 def level_image(rgb: Array, level: int) -> Array:
@@ -92,6 +107,7 @@ def empty(reason: str) -> Arrays:
         "metric_residual": np.array(np.nan, np.float32),
         "information": np.array(0, np.float32),
         "circular": np.array(False),
+        "blur": np.array(np.nan, np.float32),
         "index": np.zeros(0, np.int32),
         "xy": np.zeros((0, 2), np.float32),
         "transform": np.zeros((0, 2, 2), np.float32),
@@ -103,6 +119,7 @@ def empty(reason: str) -> Arrays:
         "normal_sigma": none,
         "inlier": none,
         "irradiance": none,
+        "irradiance_rgb": np.zeros((0, 3), np.float32),
         "irradiance_sigma": none,
     }
 
@@ -140,11 +157,41 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
         noise_floor=params.noise_floor,
         trend_order=params.trend_order,
         agreement=params.agreement,
+        spread=(params.blur * factor) ** 2 + sampling_spread(factor),
+        fit_spread=params.fit_blur,
     )
     texton = estimate_texton(image, xy[few], frames[few], where0[few], settings)
     if texton is None:
         return empty("no three of its patches look alike")
-    return finish(image, texton, xy, frames, where0, members, few[texton.founders], factor, params)
+    founders = few[texton.founders]
+    found = founders[texton.inlier > 0.8]
+    more = adopt(detect, members, found, params.adopt)
+    if len(more):
+        members = np.concatenate([members, more])
+        xy0, frames0 = detect["xy"][members].astype(np.float64), detect["frame"][members].astype(np.float64)
+        xy, frames = (xy0 + 0.5) * factor - 0.5, frames0 * (radius * factor / half)
+        where0 = (2 * xy0 - extent) / extent.max()
+    return finish(image, texton, xy, frames, where0, members, founders, factor, params)
+
+
+def adopt(detect: Mapping[str, Any], members: Indices, found: Indices, reach: float) -> Indices:
+    """Points of other clusters, or of none, that may show the same element: rows of `detect`.
+
+    k-means cuts an element's instances where their looks change with slant and light. Tried are those whose descriptor is
+    nearer to the mean of the instances `found` (rows of `members`) than the share `reach` of these, and of a like size; as
+    many at most as there are members.
+    """
+    if reach == 0 or len(found) < 4:
+        return np.zeros(0, members.dtype)
+    descriptor, kind = detect["descriptor"], detect["kind"]
+    size = np.log(np.abs(np.linalg.det(detect["frame"].astype(np.float64)))) / 2
+    own = members[found]
+    distance = np.linalg.norm(descriptor - descriptor[own].mean(0), axis=1)
+    near = (distance < np.quantile(distance[own], reach)) & (kind == kind[members[0]])
+    near &= np.abs(size - np.median(size[own])) < np.log(2.0)
+    near[members] = False
+    rows = np.flatnonzero(near)
+    return np.sort(rows[np.argsort(distance[rows], kind="stable")[: len(members)]])
 
 
 def finish(
@@ -201,12 +248,15 @@ def finish(
     sigma = normal_sigma(normal, left)
     centre = got.xy + transform @ information_centre(template)
     inlier = inlier * unique(got.xy, residual, transform, template)
+    light = channel_gains(template, sample(image, got.xy, got.frames, template.points), got.frames)
     good = inlier > 0.8
     metric_error = float(np.sqrt(np.linalg.eigvalsh(metric_cov[:3, :3])[-1]))
     reason = ""
     typical = float(np.median(sigma[good])) if good.any() else np.inf
     if good.sum() < 4:
         reason = f"only {int(good.sum())} instances agree with it"
+    elif good.sum() < min(_ENOUGH, params.min_share * len(members)):
+        reason = f"only {int(good.sum())} of {len(members)} members agree with it, as few as chance brings together"
     elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circular else 1.0):
         reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
     elif metric_error > params.max_metric_error:
@@ -224,6 +274,7 @@ def finish(
         "metric_residual": np.array(upgrade.residual, np.float32),
         "information": np.array(metric_error, np.float32),
         "circular": np.array(circular),
+        "blur": np.array(np.sqrt(max(template.spread - sampling_spread(factor), 0)) / factor, np.float32),
         "index": members.astype(np.int32),
         "xy": ((centre + 0.5) / factor - 0.5).astype(np.float32),
         "transform": transform.astype(np.float32),
@@ -235,6 +286,7 @@ def finish(
         "normal_sigma": sigma.astype(np.float32),
         "inlier": inlier.astype(np.float32),
         "irradiance": got.gain.astype(np.float32),
+        "irradiance_rgb": light.astype(np.float32),
         "irradiance_sigma": np.sqrt(residual / max(float((template.values**2).mean()), 1e-12) / samples).astype(np.float32),
     }
 

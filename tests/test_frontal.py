@@ -15,6 +15,7 @@ SINGLES = {
     "metric_residual": "float32",
     "information": "float32",
     "circular": "bool",
+    "blur": "float32",
 }
 MEMBERS = {
     "index": ("int32", ()),
@@ -28,6 +29,7 @@ MEMBERS = {
     "normal_sigma": ("float32", ()),
     "inlier": ("float32", ()),
     "irradiance": ("float32", ()),
+    "irradiance_rgb": ("float32", (3,)),
     "irradiance_sigma": ("float32", ()),
 }
 
@@ -230,6 +232,38 @@ def test_only_the_members_of_its_cluster_are_used(scene):
     got = run(scene, label=label, part=3)
     assert got["index"].tolist() == np.flatnonzero(label == 3).tolist()
     assert got["usable"]
+
+
+def test_instances_that_clustering_cut_off_are_adopted(scene):
+    """Every other instance lies in another cluster, with a descriptor like the own; a few points of that cluster do not."""
+    rng = np.random.default_rng(1)
+    detect = detect_of(scene, rng)
+    n = len(scene.xy)
+    own = np.arange(n) % 2 == 0
+    foreign = np.arange(n) % 10 == 1
+    detect["descriptor"] = (0.05 * rng.normal(size=(n, 128)) + foreign[:, None]).astype(np.float32)
+    label = np.where(own, 0, 1).astype(np.int32)
+    alone = run(scene, detect, label, adopt=0.0)
+    assert alone["index"].tolist() == np.flatnonzero(own).tolist()
+    got = run(scene, detect, label)
+    assert got["index"][: own.sum()].tolist() == alone["index"].tolist()
+    assert len(np.unique(got["index"])) == len(got["index"])
+    more = got["index"][own.sum() :]
+    assert len(more) > 0.6 * (~own & ~foreign).sum() and not foreign[more].any()
+    good = got["inlier"] > 0.8
+    assert good[own.sum() :].mean() > 0.85
+    assert np.median(normal_error(got["normal"], scene.normal[got["index"]])[good]) < 1.2
+
+
+def test_light_of_each_channel_is_right_up_to_one_factor(scene):
+    """Light that turns from red to blue across the image."""
+    size = scene.rgb.shape[1]
+    tint = np.stack([np.linspace(1.3, 0.7, size), np.ones(size), np.linspace(0.6, 1.2, size)], -1)
+    got = run(scene._replace(rgb=(scene.rgb * tint).astype(np.float32)))
+    good = got["inlier"] > 0.8
+    colour = np.stack([np.interp(scene.xy[:, 0], np.arange(size), tint[:, c]) for c in range(3)], -1)
+    log_ratio = np.log(got["irradiance_rgb"] / (scene.light[:, None] * colour))[good]
+    assert (log_ratio.std(0) < 0.02).all()
 
 
 @pytest.mark.parametrize("members", [0, 1, 2, 3])

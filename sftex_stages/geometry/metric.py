@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 
+_NOISY = 0.15  # anisotropy below which the larger singular value is biased by noise
+_STILL = 1e-5  # a step that changes no normal
 _TREND_SIGMA = 0.1  # prior of each coefficient of log s over the image: a tenth is a strong perspective
 
 
@@ -125,7 +127,7 @@ def _informs(g: Array, gram: Array) -> Array:
     """Weight in [0, 1] of an instance: its anisotropy against the level where σ_max is biased by noise."""
     l1, l2, _ = leading_eigenpair(g @ gram @ np.swapaxes(g, -1, -2))
     kappa = 1 - np.clip(l2, 0, None) / np.maximum(l1, 1e-12)
-    return kappa**2 / (kappa**2 + 0.15**2) + 0.02
+    return kappa**2 / (kappa**2 + _NOISY**2) + 0.02
 
 
 def _weighted_mad(values: Array, weights: Array) -> float:
@@ -135,24 +137,29 @@ def _weighted_mad(values: Array, weights: Array) -> float:
 
 
 def _refine(g: Array, basis: Array, weights: Array, gram: Array, shape: Array, steps: int) -> tuple[float, Array, Array, Array]:
+    lift = gram_lift(g)
+    m = np.array([gram[0, 0], gram[0, 1], gram[1, 1]])
     trend = np.zeros(basis.shape[1])
     free = len(shape)  # M moves along the rows of `shape` (free, 3)
     prior = np.r_[np.full(free, 1e-6), np.full(len(trend), 1 / _TREND_SIGMA**2)]
 
-    def residual(gram: Array, trend: Array) -> tuple[Array, Array, Array]:
-        l1, _, u = leading_eigenpair(g @ gram @ np.swapaxes(g, -1, -2))
-        l1 = np.maximum(l1, 1e-9)
-        v = np.einsum("nji,nj->ni", g, u)
-        jac = np.stack([v[:, 0] ** 2, 2 * v[:, 0] * v[:, 1], v[:, 1] ** 2], -1) / (2 * l1[:, None])
-        return 0.5 * np.log(l1) - basis @ trend, jac, l1
+    def look(m: Array, trend: Array) -> tuple[Array, Array, Array]:
+        """Residuals (N,), their derivatives by m (N, 3), and the instances' weights (N,)."""
+        xx, xy, yy = (lift @ m).T  # of G M Gᵀ
+        half = (xx - yy) / 2
+        radius = np.maximum(np.sqrt(half**2 + xy**2), 1e-12)
+        l1 = np.maximum((xx + yy) / 2 + radius, 1e-9)
+        cos, sin = half / radius, xy / radius  # of twice the leading direction's angle
+        squares = np.stack([(1 + cos) / 2, sin, (1 - cos) / 2], -1)
+        jac = (squares[:, None, :] @ lift)[:, 0] / (2 * l1[:, None])
+        kappa2 = np.minimum(2 * radius / l1, 1.0) ** 2
+        return 0.5 * np.log(l1) - basis @ trend, jac, weights * (kappa2 / (kappa2 + _NOISY**2) + 0.02)
 
-    def cost(r: Array, w: Array, scale: float, trend: Array) -> float:
-        return float((w * np.log1p((r / scale) ** 2)).sum() / w.sum())
+    def cost(r: Array, w: Array, scale: float) -> float:
+        return float(w @ np.log1p((r / scale) ** 2) / w.sum())
 
-    r, jac, _ = residual(gram, trend)
-    w = weights * _informs(g, gram)
+    r, jac, w = look(m, trend)
     for _ in range(steps):
-        w = weights * _informs(g, gram)
         scale = max(_weighted_mad(r, w), 3e-3)
         robust = w / (1 + (r / (2 * scale)) ** 2)
         full = np.concatenate([jac @ shape.T, -basis], 1)
@@ -161,22 +168,27 @@ def _refine(g: Array, basis: Array, weights: Array, gram: Array, shape: Array, s
         grad[free:] += trend / _TREND_SIGMA**2
         step = -np.linalg.solve(normal, grad)
         move = step[:free] @ shape
-        here = cost(r, w, 2 * scale, trend)
+        here = cost(r, w, 2 * scale)
         for fraction in (1.0, 0.5, 0.25, 0.1):
-            new_gram = gram + fraction * np.array([[move[0], move[1]], [move[1], move[2]]])
-            if np.linalg.eigvalsh(new_gram)[0] < 0.02:
+            new = m + fraction * move
+            if _smallest(new) < 0.02:
                 continue
             new_trend = trend + fraction * step[free:]
-            new_r, new_jac, _ = residual(new_gram, new_trend)
-            if cost(new_r, w, 2 * scale, new_trend) < here + 1e-9:
-                gram, trend, r, jac = new_gram, new_trend, new_r, new_jac
+            new_r, new_jac, new_w = look(new, new_trend)
+            if cost(new_r, w, 2 * scale) < here + 1e-9:
+                m, trend, r, jac, w = new, new_trend, new_r, new_jac, new_w
                 break
         else:
             break
-        if np.abs(step).max() * fraction < 1e-6:
+        if np.abs(step).max() * fraction < _STILL:
             break
     # starts are compared on one robust scale: the log of their own spread
-    return float(np.log(max(_weighted_mad(r, w), 1e-4))), gram, trend, r
+    return float(np.log(max(_weighted_mad(r, w), 1e-4))), np.array([[m[0], m[1]], [m[1], m[2]]]), trend, r
+
+
+def _smallest(m: Array) -> float:
+    """Smaller eigenvalue of ((m1, m2), (m2, m3))."""
+    return float((m[0] + m[2]) / 2 - np.hypot((m[0] - m[2]) / 2, m[1]))
 
 
 def metric_covariance(

@@ -4,6 +4,11 @@ Inverse-compositional steps (Baker & Matthews, IJCV 2004): the template's gradie
 so that a step for all instances is one bilinear sampling and one matrix product. The relative irradiance (gain) is
 solved for together with the six affine parameters: a patch d is explained as L (µ + ∇µ · Δ), which is linear in
 (L, L Δ).
+
+The image is blurred by its pixels, whatever the slant: seen on the element, the point spread of an instance with
+transform T is T⁻¹ T⁻ᵀ wide, so that a steep instance is blurred more along its tilt than the mean of all. To first order
+in that difference C the patch is µ + ½ C : ∇∇µ. Left out, small detail looks too wide where it is foreshortened, and
+slants come out too small.
 """
 
 from typing import NamedTuple
@@ -14,6 +19,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 
+_MOST_BLUR = 2.0  # texton units²: beyond it the first order says nothing
+_SPREAD_PRIOR, _SPREAD_DOUBT = 0.7, 0.25  # of the logarithm of the point spread: before looking, and at best
 _ROWS = 30_000  # cv2.remap takes maps of fewer than 32768 rows
 
 
@@ -47,22 +54,49 @@ class Template(NamedTuple):
     points: Array  # (P, 2) texton units
     values: Array  # (P, C) µ
     weights: Array  # (P,) inverse-variance weights, 0 outside the domain
-    basis: Array  # (P·C, 7) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t]
-    gram: Array  # (7, 7) basisᵀ basis
+    basis: Array  # (P·C, 10) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy)]
+    gram: Array  # (10, 10) basisᵀ basis
+    spread: float  # variance of the image's point spread, px²
+    mean_blur: Array  # (3,) mean of `blur` over the instances that µ is the mean of
 
 
-def make_template(values: Array, weights: Array, spacing: float) -> Template:
-    """Template from the texton's appearance `values` (n, n, C), pixel weights (n, n) and grid spacing."""
+def blur(frames: Array) -> Array:
+    """(M, 3): xx, xy, yy of T⁻¹ T⁻ᵀ, the point spread of instances with `frames` (M, 2, 2) as their element sees it."""
+    a, b, c, d = frames[:, 0, 0], frames[:, 0, 1], frames[:, 1, 0], frames[:, 1, 1]
+    area = (a * d - b * c) ** 2
+    return np.stack([(b * b + d * d) / area, -(a * b + c * d) / area, (a * a + c * c) / area], -1)
+
+
+def make_template(
+    values: Array, weights: Array, spacing: float, spread: float = 0.0, mean_blur: Array | None = None
+) -> Template:
+    """Template from the texton's appearance `values` (n, n, C), pixel weights (n, n) and grid spacing.
+
+    `spread` (px²) and `mean_blur` (3,) describe the blur that `values` contain; without them blur is taken to be common.
+    """
     n, channels = values.shape[0], values.shape[2]
     gy, gx = np.gradient(values, spacing, axis=(0, 1))
     points = patch_grid(n // 2, spacing)
     sx, sy = points[:, :1], points[:, 1:]
     gx, gy = gx.reshape(-1, channels), gy.reshape(-1, channels)
     flat = values.reshape(-1, channels)
-    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy]
+    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    xx = (padded[1:-1, 2:] - 2 * values + padded[1:-1, :-2]) / (2 * spacing**2)
+    yy = (padded[2:, 1:-1] - 2 * values + padded[:-2, 1:-1]) / (2 * spacing**2)
+    xy = (padded[2:, 2:] - padded[2:, :-2] - padded[:-2, 2:] + padded[:-2, :-2]) / (4 * spacing**2)
+    second = [a.reshape(-1, channels) for a in (xx, xy, yy)]
+    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy, *second]
     root = np.sqrt(weights.reshape(-1, 1))
     basis = np.stack([(c * root).ravel() for c in columns], -1).astype(np.float64)
-    return Template(points, flat, weights.ravel(), basis, basis.T @ basis)
+    mean_blur = np.zeros(3) if mean_blur is None else mean_blur
+    return Template(points, flat, weights.ravel(), basis, basis.T @ basis, spread, mean_blur)
+
+
+def excess_blur(template: Template, frames: Array) -> Array:
+    """(M, 3): what the point spread of instances is wider than the template's."""
+    if template.spread == 0:
+        return np.zeros((len(frames), 3))
+    return np.clip(template.spread * (blur(frames) - template.mean_blur), -_MOST_BLUR, _MOST_BLUR)
 
 
 class Solver(NamedTuple):
@@ -70,7 +104,7 @@ class Solver(NamedTuple):
 
     used: NDArray[np.bool_]  # (P,), points with weight
     root: Array  # (P',) √w there
-    basis: Array  # (P'·C, 7) float32
+    basis: Array  # (P'·C, 10) float32
     unit: Array  # (6,) radius for shifts, 1 for strains: one damping serves both
     values: Array  # (6,) eigenvalues of the Hessian with the gain marginalised
     vectors: Array  # (6, 6)
@@ -91,32 +125,79 @@ def make_solver(template: Template) -> Solver:
 def marginal_hessian(template: Template) -> Array:
     """(6, 6) Hessian of the registration in (a11, a12, a21, a22, t1, t2) with the gain solved for (Schur complement)."""
     gram = template.gram
-    return gram[1:, 1:] - np.outer(gram[1:, 0], gram[0, 1:]) / gram[0, 0]
+    return gram[1:7, 1:7] - np.outer(gram[1:7, 0], gram[0, 1:7]) / gram[0, 0]
 
 
-def explain(template: Template, solver: Solver, patches: Array) -> tuple[Array, Array, Array]:
-    """Projections (M, 7) of patches (M, P', C) at the used points, gains (M,) and mean squared residuals (M,) / gain²."""
+def explain(template: Template, solver: Solver, patches: Array, excess: Array) -> tuple[Array, Array, Array]:
+    """What is left of patches (M, P', C) at the used points, with `excess` (M, 3) blur.
+
+    Returns the projections (M, 6) of d / L − µ on the derivatives, gains (M,), mean squared residuals (M,) / gain².
+    """
     d = (patches * solver.root[None, :, None]).reshape(len(patches), -1)
     projected = (d @ solver.basis).astype(np.float64)
-    power = template.gram[0, 0]
-    gain = np.maximum(projected[:, 0] / power, 1e-6)
-    energy = np.maximum(np.einsum("mp,mp->m", d, d, dtype=np.float64) / gain**2 - power, 0)
-    return projected, gain, energy / (template.weights.sum() * template.values.shape[1])
+    gram = template.gram
+    along = gram[:7, 0] + excess @ gram[7:, :7]  # of the blurred template, on [µ, derivatives]
+    own = along[:, 0] + np.einsum("mi,mi->m", excess, gram[7:, 0] + excess @ gram[7:, 7:])
+    gain = np.maximum((projected[:, 0] + np.einsum("mi,mi->m", excess, projected[:, 7:])) / own, 1e-6)
+    energy = np.maximum(np.einsum("mp,mp->m", d, d, dtype=np.float64) / gain**2 - own, 0)
+    left = projected[:, 1:7] / gain[:, None] - along[:, 1:]
+    return left, gain, energy / (template.weights.sum() * template.values.shape[1])
 
 
-def solve_step(template: Template, solver: Solver, projected: Array, gain: Array, damping: Array, limit: float) -> Array:
-    """Damped Gauss–Newton steps (M, 6) (strain, shift); steps beyond `limit` (strain, or shift in radii) are shortened."""
-    right = (projected[:, 1:] / gain[:, None] - template.gram[1:, 0][None]) * solver.unit
+def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Array:
+    """Damped Gauss–Newton steps (M, 6) (strain, shift) from what `explain` left; steps beyond `limit` (strain, or shift in
+    radii) are shortened."""
+    right = left * solver.unit
     step = ((right @ solver.vectors) / (solver.values + damping[:, None] * solver.values[-1])) @ solver.vectors.T
     size = np.abs(step).max(1)
     return step * np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None] * solver.unit
 
 
-def registration_step(template: Template, patches: Array, damping: float, limit: float = 0.35) -> tuple[Array, Array, Array]:
-    """One step for patches (M, P, C) sampled at the template's points: (steps (M, 6), gains (M,), residuals (M,))."""
+def channel_gains(template: Template, patches: Array, frames: Array) -> Array:
+    """(M, C) gain of each channel of patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2)."""
+    _, points, channels = patches.shape
+    second = template.basis[:, 7:].reshape(points, channels, 3)
+    root = np.sqrt(template.weights)[:, None]
+    model = template.basis[:, 0].reshape(points, channels) + np.einsum("pck,mk->mpc", second, excess_blur(template, frames))
+    seen = np.einsum("mpc,mpc->mc", patches * root, model)
+    return np.maximum(seen / np.maximum(np.einsum("mpc,mpc->mc", model, model), 1e-30), 1e-6)
+
+
+def estimate_spread(template: Template, patches: Array, frames: Array, weights: Array, noise2: float, prior: float) -> float:
+    """Variance of the point spread (px²) that best explains how patches (M, P, C) differ from their mean.
+
+    One number for all instances: the part of the residual along ½ C : ∇∇µ that neither the gain nor an affine step takes
+    up. In logarithms, against `prior` (known to a factor of two); `noise2` is the residuals' variance.
+    """
+    plain = template._replace(spread=0.0)
+    solver = make_solver(plain)
+    d = (patches[:, solver.used] * solver.root[None, :, None]).reshape(len(patches), -1)
+    projected = (d @ solver.basis).astype(np.float64)
+    gram = template.gram
+    left = projected / np.maximum(projected[:, :1] / gram[0, 0], 1e-6) - gram[0]
+    wide = blur(frames) - template.mean_blur
+    sure = weights * (np.abs(prior * wide).max(1) < _MOST_BLUR)
+    cross = wide @ gram[7:, :7]
+    taken = np.linalg.solve(gram[:7, :7] + 1e-6 * np.diag(np.diag(gram)[:7]), cross.T).T
+    seen = sure @ (np.einsum("mi,mi->m", wide, left[:, 7:]) - np.einsum("mi,mi->m", taken, left[:, :7]))
+    power = sure @ (np.einsum("mi,ij,mj->m", wide, gram[7:, 7:], wide) - np.einsum("mi,mi->m", taken, cross))
+    if power <= 0:
+        return prior
+    found = max(seen / power, 0.05 * prior)
+    # neighbouring samples share their noise (eight to one), and no model is exact: a quarter
+    doubt = _SPREAD_DOUBT**2 + 8 * noise2 / power / found**2
+    share = _SPREAD_PRIOR**2 / (_SPREAD_PRIOR**2 + doubt)
+    return float(prior * (found / prior) ** share)
+
+
+def registration_step(
+    template: Template, patches: Array, frames: Array, damping: float, limit: float = 0.35
+) -> tuple[Array, Array, Array]:
+    """One step for patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2): (steps (M, 6), gains (M,),
+    residuals (M,))."""
     solver = make_solver(template)
-    projected, gain, residual = explain(template, solver, patches[:, solver.used])
-    step = solve_step(template, solver, projected, gain, np.full(len(patches), damping), limit)
+    left, gain, residual = explain(template, solver, patches[:, solver.used], excess_blur(template, frames))
+    step = solve_step(solver, left, np.full(len(patches), damping), limit)
     return step, gain, residual
 
 
@@ -153,17 +234,19 @@ def register(
     points = template.points[solver.used]
     xy, frames = xy.copy(), frames.copy()
     lam = np.full(len(xy), damping)
-    projected, gain, residual = explain(template, solver, sample(image, xy, frames, points))
+    left, gain, residual = explain(template, solver, sample(image, xy, frames, points), excess_blur(template, frames))
     active = np.arange(len(xy))
     for _ in range(steps):
-        step = solve_step(template, solver, projected[active], gain[active], lam[active], limit)
+        step = solve_step(solver, left[active], lam[active], limit)
         new_xy, new_frames = compose_step(xy[active], frames[active], step)
-        new = explain(template, solver, sample(image, new_xy, new_frames, points))
+        new = explain(
+            template, solver, sample(image, new_xy, new_frames, points), excess_blur(template, new_frames)
+        )
         better = new[2] < residual[active]
         lam[active] = np.clip(np.where(better, lam[active] * 0.3, lam[active] * 10), 1e-6, 1e3)
         moved = active[better]
         xy[moved], frames[moved] = new_xy[better], new_frames[better]
-        projected[moved], gain[moved], residual[moved] = (part[better] for part in new)
+        left[moved], gain[moved], residual[moved] = (part[better] for part in new)
         active = active[np.abs(step / solver.unit).max(1) > 1e-3]
         if len(active) == 0:
             break

@@ -5,6 +5,7 @@ affine frames, upgrade the frames to metric (Lemma 4), then EM with every frame 
 domain grows to where the patches agree.
 """
 
+import functools
 from typing import NamedTuple
 
 import cv2
@@ -13,7 +14,17 @@ from numpy.typing import NDArray
 
 from .imaging import tensor_of
 from .metric import Upgrade, circle_metric, gram_lift, leading_eigenpair, metric_upgrade, project_tensors
-from .registration import Template, compose_step, make_template, marginal_hessian, patch_grid, registration_step, sample
+from .registration import (
+    Template,
+    blur,
+    compose_step,
+    estimate_spread,
+    make_template,
+    marginal_hessian,
+    patch_grid,
+    registration_step,
+    sample,
+)
 
 Array = NDArray[np.floating]
 
@@ -30,6 +41,8 @@ class Settings(NamedTuple):
     noise_floor: float  # standard deviation of a texton pixel that no agreement can undercut, in units of contrast
     trend_order: int  # order of the trend of log s
     agreement: float  # share of the unrelated variance below which a pixel belongs to the element
+    spread: float  # variance of the image's point spread, px², before looking
+    fit_spread: bool
 
 
 class Estimate(NamedTuple):
@@ -49,11 +62,14 @@ class Estimate(NamedTuple):
     history: list[tuple[int, Array, Array, Array]]  # (iteration, xy, frames, inlier)
 
 
+@functools.lru_cache(maxsize=64)
 def centre_window(half: int) -> Array:
     """Soft round window (n, n): 1 at the centre, 0 outside the inscribed circle."""
     axis = np.arange(-half, half + 1) / (half + 0.5)
     r2 = axis[:, None] ** 2 + axis[None, :] ** 2
-    return np.where(r2 < 1, np.exp(-1.5 * r2), 0.0)
+    window = np.where(r2 < 1, np.exp(-1.5 * r2), 0.0)
+    window.setflags(write=False)
+    return window
 
 
 def seed_members(patches: Array, window: Array) -> Array:
@@ -142,16 +158,17 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
     gain = np.maximum(np.einsum("mpc,p->m", patches, window.ravel()) / window.sum(), 1e-6)
     gain /= np.median(gain[inlier > 0])
     values, var = weighted_mean(patches, gain, inlier)
+    mean_blur = inlier @ blur(frames) / inlier.sum()
     weights, noise2, prior, contrast2 = window, 0.0, 0.7, 1.0
     history: list[tuple[int, Array, Array, Array]] = []
     scale = np.ones(len(xy))
-    last_growth, spacing = 0, 1.0
+    last_growth, spacing, spread = 0, 1.0, settings.spread
     founders: NDArray[np.integer] = np.arange(len(xy))
     for iteration in range(1, settings.iterations + 1):
-        template = make_template(values.reshape(n, n, -1), weights, spacing)
+        template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur)
         contrast2 = weighted_contrast(template)
         # M-step for the transforms and gains, E-step for δ, all from the patches in hand
-        step, gain, residual = registration_step(template, patches, _DAMPING)
+        step, gain, residual = registration_step(template, patches, frames, _DAMPING)
         if iteration == 1:
             noise2 = float(np.median(residual[inlier > 0.3]))
         samples = independent_samples(template)
@@ -161,6 +178,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             prior = float(np.clip(inlier.mean(), 0.05, 0.98))
         if inlier.sum() < 2.5:
             return None
+        seen_by = frames  # the frames that `patches` were sampled through
         xy, frames = compose_step(xy, frames, step)
         if iteration == settings.affine_iterations:
             # what is no view of this element by now is left to the last registration
@@ -173,6 +191,8 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         if iteration >= settings.affine_iterations:
             since = iteration - settings.affine_iterations
             if since % _UPGRADE_EVERY == 0:
+                if settings.fit_spread and since > 0:
+                    spread = estimate_spread(template, patches, seen_by, inlier, noise2, settings.spread)
                 order = settings.trend_order if len(xy) >= 12 else 0
                 upgrade, _ = upgrade_texton(template, frames, where, inlier + 1e-6, order, 30 if since == 0 else 5, since > 0)
                 frames, scale = frames @ np.linalg.cholesky(upgrade.gram), np.exp(upgrade.log_scale)
@@ -189,7 +209,9 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         # M-step for the appearance
         patches = sample(image, xy, frames, patch_grid(half, spacing))
         gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
-        values, var = weighted_mean(patches, gain, inlier * _sharpness(frames))
+        shares = inlier * _sharpness(frames)
+        values, var = weighted_mean(patches, gain, shares)
+        mean_blur = shares @ blur(frames) / shares.sum()
         weights = domain_weights(values, var, half, 0.1, settings.agreement)
         if (weights > 0).sum() < 9:
             return None
@@ -198,7 +220,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             break
     # EM that has settled would not change any more: its last state stands for the iterations that were not needed
     history += [(k, xy, frames, inlier) for k in PROGRESS if iteration < k <= settings.iterations]
-    template = make_template(values.reshape(n, n, -1), weights, spacing)
+    template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur)
     noise = float(np.sqrt(noise2))
     values = values.reshape(n, n, -1)
     return Estimate(template, values, weights, half, spacing, founders, xy, frames, inlier, noise, prior, history)
@@ -244,7 +266,7 @@ def marginal_strain(template: Template) -> Array:
 
 def information_centre(template: Template) -> Array:
     """Centre (2,) of the detail that fixes the transform: mean position weighted by w |∇µ|²."""
-    power = (template.basis[:, 5:] ** 2).sum(1).reshape(len(template.points), -1).sum(1)
+    power = (template.basis[:, 5:7] ** 2).sum(1).reshape(len(template.points), -1).sum(1)
     return power @ template.points / max(power.sum(), 1e-30)
 
 

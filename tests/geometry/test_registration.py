@@ -6,7 +6,9 @@ from scipy.ndimage import map_coordinates
 
 from sftex_stages.geometry.imaging import compose
 from sftex_stages.geometry.registration import (
+    blur,
     compose_step,
+    estimate_spread,
     explain,
     make_solver,
     make_template,
@@ -105,7 +107,7 @@ def test_basis_is_the_derivative_of_sampling(rng):
     template = make_template(values.reshape(n, n, 3), weights, spacing)
     inside = (weights.ravel() > 0) & (np.abs(points) < half * spacing).all(1)
     root = np.sqrt(weights.ravel())[:, None]
-    basis = template.basis.reshape(len(points), 3, 7)
+    basis = template.basis.reshape(len(points), 3, 10)
     assert np.abs(basis[..., 0] - root * values).max() < 1e-6
     # on this grid the template's differences span 2 × spacing: so does the difference of the sampling
     for k in range(6):
@@ -135,7 +137,7 @@ def test_basis_of_a_smooth_element_is_the_derivative_of_its_warp():
     points = patch_grid(half, spacing).astype(float)
     weights = centre_window(half)
     template = make_template(quadratic(points).reshape(n, n, 2), weights, spacing)
-    basis = template.basis.reshape(n * n, 2, 7)
+    basis = template.basis.reshape(n * n, 2, 10)
     inside = (weights.ravel() > 0) & (np.abs(points) < (half - 0.5) * spacing).all(1)
     for k in range(6):
         delta = np.zeros(6)
@@ -144,12 +146,17 @@ def test_basis_of_a_smooth_element_is_the_derivative_of_its_warp():
         ends = [quadratic(points @ (np.eye(2) + e * strain).T + e * shift) for e in (1, -1)]
         numeric = np.sqrt(weights.ravel())[:, None] * (ends[0] - ends[1]) / 2e-5
         assert np.abs(basis[inside, :, k + 1] - numeric[inside]).max() < 1e-5
+    # ½ C : ∇∇µ of these quadratics: half of xx, the whole of xy, half of yy
+    root = np.sqrt(weights.ravel())[:, None]
+    second = np.array([[0, -0.05], [0.03, 0.04], [0, 0.02]])
+    for k in range(3):
+        assert np.abs(basis[inside, :, 7 + k] - (root * second[k])[inside]).max() < 1e-5
 
 
 def test_marginal_hessian_is_what_is_left_when_the_gain_is_solved_for(rng):
     template = exact_template()
     x = rng.normal(size=6)
-    design = template.basis
+    design = template.basis[:, :7]
     target = design[:, 1:] @ x
     left = target - design[:, 0] * (design[:, 0] @ target) / (design[:, 0] @ design[:, 0])
     assert x @ marginal_hessian(template) @ x == pytest.approx(left @ left, rel=1e-9)
@@ -162,7 +169,7 @@ def test_small_affine_warps_and_gains_are_recovered_exactly(rng):
     frames = true_frames @ (np.eye(2) + rng.uniform(-0.12, 0.12, (m, 2, 2)))
     xy = centres + rng.uniform(-4, 4, (m, 2))
     got = register(image, exact_template(), xy, frames, steps=25)
-    assert np.abs(got.xy - centres).max() < 5e-3  # px, of 5 px a unit
+    assert np.abs(got.xy - centres).max() < 1e-2  # px, of 5 px a unit
     strain = np.linalg.solve(true_frames, got.frames) - np.eye(2)
     assert np.abs(strain).max() < 1e-3
     # bilinear interpolation between the pixels of a curved profile loses up to half a percent
@@ -181,7 +188,7 @@ def test_recovery_from_exact_samples_has_no_error_of_its_own(rng):
     for _ in range(30):
         warped = np.einsum("mij,pj->mpi", frames, points) + xy[:, None] - where[:, None]
         patches = gains[:, None, None] * texture(np.einsum("mij,mpj->mpi", np.linalg.inv(truth), warped))
-        step, gain, residual = registration_step(template, patches, damping=0.0)
+        step, gain, residual = registration_step(template, patches, frames, damping=0.0)
         xy, frames = compose_step(xy, frames, step)
     assert np.abs(xy - where).max() < 1e-5
     assert np.abs(frames - truth).max() < 1e-5
@@ -214,7 +221,7 @@ def test_reported_gain_and_residual_are_those_of_the_reported_frames(rng):
     got = register(image, template, centres + 1, views(rng, m), steps=3)
     solver = make_solver(template)
     patches = sample(image, got.xy, got.frames, template.points)
-    _, gain, residual = explain(template, solver, patches[:, solver.used])
+    _, gain, residual = explain(template, solver, patches[:, solver.used], np.zeros((m, 3)))
     assert got.gain == pytest.approx(gain) and got.residual == pytest.approx(residual)
     w = template.weights[:, None]
     for k in range(m):
@@ -238,9 +245,68 @@ def test_compose_step_is_the_inverse_composition(rng):
 def test_long_steps_are_shortened_without_turning():
     template = exact_template()
     patches = texture(template.points.astype(float) * 1.6)[None]
-    free, _, _ = registration_step(template, patches, damping=0.0, limit=1e9)
-    short, _, _ = registration_step(template, patches, damping=0.0, limit=0.1)
+    frames = np.eye(2)[None]
+    free, _, _ = registration_step(template, patches, frames, damping=0.0, limit=1e9)
+    short, _, _ = registration_step(template, patches, frames, damping=0.0, limit=0.1)
     unit = make_solver(template).unit
     assert np.abs(free / unit).max() > 0.1
     assert np.abs(short / unit).max() == pytest.approx(0.1)
     assert short / np.linalg.norm(short) == pytest.approx(free / np.linalg.norm(free))
+
+
+def blobs(s, c):
+    """An element of Gaussian blobs at s (P, 2), blurred by a Gaussian of covariance c (2, 2): exact at any blur."""
+    total = np.ones(len(s))
+    for x, y, width, height in ((-3, -1, 1.6, 0.8), (2, 3, 1.4, 0.6), (3, -3, 1.8, -0.5), (-1, 4, 1.5, -0.4), (0, 0, 1.7, 0.5)):
+        wide = width**2 * np.eye(2) + c
+        offset = s - (x, y)
+        power = -0.5 * ((offset @ np.linalg.inv(wide)) * offset).sum(1)
+        total += height * width**2 / np.sqrt(np.linalg.det(wide)) * np.exp(power)
+    return total[:, None]
+
+
+def steep_views(rng, m):
+    """Frames of one pixel a texton unit, slants up to 60°."""
+    return compose(rng.uniform(-3, 3, m), np.radians(rng.uniform(10, 60, m)), rng.uniform(-3, 3, m), np.ones(m))
+
+
+def blurred(truth, frames, spread, points):
+    """Patches seen through `frames` of instances at the origin, in an image blurred by `spread` px²."""
+    out = []
+    for t, f in zip(truth, frames, strict=True):
+        inverse = np.linalg.inv(t)
+        out.append(blobs(points @ (inverse @ f).T, spread * inverse @ inverse.T))
+    return np.stack(out)
+
+
+def test_pixels_do_not_make_steep_elements_look_wider(rng):
+    """Registered to the mean of all, instances keep their true frames to a fifth of what the point spread would bend."""
+    m, half, spread = 30, 10, 0.35
+    n, points = 2 * half + 1, patch_grid(half, 1.0).astype(float)
+    truth = steep_views(rng, m)
+    values = blurred(truth, truth, spread, points).mean(0).reshape(n, n, 1)
+    bent = []
+    for known in (0.0, spread):
+        template = make_template(values, centre_window(half), 1.0, known, blur(truth).mean(0))
+        frames = truth
+        for _ in range(20):
+            step, _, _ = registration_step(template, blurred(truth, frames, spread, points), frames, damping=0.0)
+            step[:, 4:] = 0  # the views are centred; shifts would only exercise the sampling
+            frames = compose_step(np.zeros((m, 2)), frames, step)[1]
+        bent.append(np.abs(np.linalg.solve(truth, frames) - np.eye(2)).max((1, 2)))
+    assert np.median(bent[0]) > 0.004
+    assert np.median(bent[1]) < 0.2 * np.median(bent[0])
+
+
+def test_point_spread_is_found_from_how_instances_differ(rng):
+    m, half = 40, 10
+    n, points = 2 * half + 1, patch_grid(half, 1.0).astype(float)
+    truth = steep_views(rng, m)
+    for spread in (0.15, 0.35, 0.7):
+        patches = blurred(truth, truth, spread, points)
+        patches *= rng.uniform(0.5, 2, m)[:, None, None]
+        gain = patches.mean((1, 2)) / patches.mean()
+        values = (patches / gain[:, None, None]).mean(0).reshape(n, n, 1)
+        template = make_template(values, centre_window(half), 1.0, 0.35, blur(truth).mean(0))
+        found = estimate_spread(template, patches, truth, np.ones(m), 1e-8, prior=0.35)
+        assert found == pytest.approx(spread, rel=0.25)
