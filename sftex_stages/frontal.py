@@ -28,6 +28,7 @@ from .geometry.texton import (
     information_centre,
     posterior,
     strain_covariance,
+    strain_error,
     tensor_covariance,
     upgrade_texton,
     weighted_contrast,
@@ -59,6 +60,7 @@ class Params(StageParams):
     trend_order: int = Field(1, ge=0, le=2, description="order of the polynomial trend of log scale (perspective)")
     max_metric_residual: float = Field(0.03, gt=0, description="a texton above is unusable")
     min_share: float = Field(0.3, ge=0, le=1, description="share of the members (or 20 of them) that must agree with a texton")
+    max_strain_error: float = Field(0.12, gt=0, description="a texton that some strain of it changes too little is unusable")
     max_metric_error: float = Field(0.07, gt=0, description="a texton whose stretch is known less well is unusable")
     max_sigma: float = Field(8.0, gt=0, description="a texton whose typical normal error is larger (degrees) is unusable")
 
@@ -106,6 +108,7 @@ def empty(reason: str) -> Arrays:
         "progress_iterations": np.zeros(0, np.int32),
         "metric_residual": np.array(np.nan, np.float32),
         "information": np.array(0, np.float32),
+        "strain_error": np.array(np.nan, np.float32),
         "circular": np.array(False),
         "blur": np.array(np.nan, np.float32),
         "index": np.zeros(0, np.int32),
@@ -248,9 +251,11 @@ def finish(
     sigma = normal_sigma(normal, left)
     centre = got.xy + transform @ information_centre(template)
     inlier = inlier * unique(got.xy, residual, transform, template)
-    light = channel_gains(template, sample(image, got.xy, got.frames, template.points), got.frames)
+    light = channel_gains(template, sample(image, got.xy, got.frames, template.points), got.frames, got.slope)
     good = inlier > 0.8
     metric_error = float(np.sqrt(np.linalg.eigvalsh(metric_cov[:3, :3])[-1]))
+    least = max(float(np.median(residual[good])) if good.any() else 0.0, params.noise_floor**2 * contrast2)
+    weakest = strain_error(template, least)
     reason = ""
     typical = float(np.median(sigma[good])) if good.any() else np.inf
     if good.sum() < 4:
@@ -259,6 +264,8 @@ def finish(
         reason = f"only {int(good.sum())} of {len(members)} members agree with it, as few as chance brings together"
     elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circular else 1.0):
         reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
+    elif weakest > params.max_strain_error:
+        reason = f"it is too plain along one direction, as an edge is, to fix slant and tilt (error {weakest:.2f})"
     elif metric_error > params.max_metric_error:
         reason = f"its instances keep one direction of the element and do not fix its stretch (error {metric_error:.2f})"
     elif typical > params.max_sigma:
@@ -273,6 +280,7 @@ def finish(
         "progress_iterations": np.array([h[0] for h in texton.history], np.int32),
         "metric_residual": np.array(upgrade.residual, np.float32),
         "information": np.array(metric_error, np.float32),
+        "strain_error": np.array(weakest, np.float32),
         "circular": np.array(circular),
         "blur": np.array(np.sqrt(max(template.spread - sampling_spread(factor), 0)) / factor, np.float32),
         "index": members.astype(np.int32),

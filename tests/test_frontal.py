@@ -14,6 +14,7 @@ SINGLES = {
     "spacing": "float32",
     "metric_residual": "float32",
     "information": "float32",
+    "strain_error": "float32",
     "circular": "bool",
     "blur": "float32",
 }
@@ -251,7 +252,7 @@ def test_instances_that_clustering_cut_off_are_adopted(scene):
     more = got["index"][own.sum() :]
     assert len(more) > 0.6 * (~own & ~foreign).sum() and not foreign[more].any()
     good = got["inlier"] > 0.8
-    assert good[own.sum() :].mean() > 0.85
+    assert good[own.sum() :].mean() > 0.7
     assert np.median(normal_error(got["normal"], scene.normal[got["index"]])[good]) < 1.2
 
 
@@ -295,7 +296,7 @@ def test_an_edge_is_unusable_with_a_reason():
         return PAPER * (1 - 0.7 * dark) * np.ones(3)
 
     scene = render(element=edge, radius=17, pitch=60, size=360)
-    assert reason_of(run(scene, max_growth=1.0)) != ""
+    assert "as an edge is" in reason_of(run(scene, max_growth=1.0))
 
 
 def test_noise_is_unusable_with_a_reason():

@@ -9,6 +9,8 @@ The image is blurred by its pixels, whatever the slant: seen on the element, the
 transform T is T⁻¹ T⁻ᵀ wide, so that a steep instance is blurred more along its tilt than the mean of all. To first order
 in that difference C the patch is µ + ½ C : ∇∇µ. Left out, small detail looks too wide where it is foreshortened, and
 slants come out too small.
+
+Light changes across an element that lies in a fold: its gain is L (1 + γ · s), and γ is solved for together with L.
 """
 
 from typing import NamedTuple
@@ -54,8 +56,9 @@ class Template(NamedTuple):
     points: Array  # (P, 2) texton units
     values: Array  # (P, C) µ
     weights: Array  # (P,) inverse-variance weights, 0 outside the domain
-    basis: Array  # (P·C, 10) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy)]
-    gram: Array  # (10, 10) basisᵀ basis
+    basis: Array  # (P·C, 12) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy), µ s / radius (x, y)]
+    gram: Array  # (12, 12) basisᵀ basis
+    radius: float  # of the grid, texton units
     spread: float  # variance of the image's point spread, px²
     mean_blur: Array  # (3,) mean of `blur` over the instances that µ is the mean of
 
@@ -85,11 +88,12 @@ def make_template(
     yy = (padded[2:, 1:-1] - 2 * values + padded[:-2, 1:-1]) / (2 * spacing**2)
     xy = (padded[2:, 2:] - padded[2:, :-2] - padded[:-2, 2:] + padded[:-2, :-2]) / (4 * spacing**2)
     second = [a.reshape(-1, channels) for a in (xx, xy, yy)]
-    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy, *second]
+    radius = n // 2 * spacing
+    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy, *second, flat * sx / radius, flat * sy / radius]
     root = np.sqrt(weights.reshape(-1, 1))
     basis = np.stack([(c * root).ravel() for c in columns], -1).astype(np.float64)
     mean_blur = np.zeros(3) if mean_blur is None else mean_blur
-    return Template(points, flat, weights.ravel(), basis, basis.T @ basis, spread, mean_blur)
+    return Template(points, flat, weights.ravel(), basis, basis.T @ basis, radius, spread, mean_blur)
 
 
 def excess_blur(template: Template, frames: Array) -> Array:
@@ -104,7 +108,7 @@ class Solver(NamedTuple):
 
     used: NDArray[np.bool_]  # (P,), points with weight
     root: Array  # (P',) √w there
-    basis: Array  # (P'·C, 10) float32
+    basis: Array  # (P'·C, 12) float32
     unit: Array  # (6,) radius for shifts, 1 for strains: one damping serves both
     values: Array  # (6,) eigenvalues of the Hessian with the gain marginalised
     vectors: Array  # (6, 6)
@@ -122,26 +126,48 @@ def make_solver(template: Template) -> Solver:
     return Solver(used, np.sqrt(weights).astype(np.float32), basis, unit, np.maximum(values, 0), vectors)
 
 
+_MOTION, _BLUR, _LIGHT = slice(1, 7), slice(7, 10), [0, 10, 11]  # columns of the basis
+
+
+def light_gram(template: Template) -> Array:
+    """(3, 3) normal matrix of the gain and its slope, the slope held by a weak prior (a third of the gain per radius)."""
+    return template.gram[np.ix_(_LIGHT, _LIGHT)] + 1e-3 * template.gram[0, 0] * np.diag([0.0, 1, 1])
+
+
 def marginal_hessian(template: Template) -> Array:
-    """(6, 6) Hessian of the registration in (a11, a12, a21, a22, t1, t2) with the gain solved for (Schur complement)."""
+    """(6, 6) Hessian of the registration in (a11, a12, a21, a22, t1, t2) with the light solved for (Schur complement)."""
     gram = template.gram
-    return gram[1:7, 1:7] - np.outer(gram[1:7, 0], gram[0, 1:7]) / gram[0, 0]
+    cross = gram[_LIGHT, _MOTION]
+    return gram[_MOTION, _MOTION] - cross.T @ np.linalg.solve(light_gram(template), cross)
 
 
-def explain(template: Template, solver: Solver, patches: Array, excess: Array) -> tuple[Array, Array, Array]:
-    """What is left of patches (M, P', C) at the used points, with `excess` (M, 3) blur.
+class Explained(NamedTuple):
+    """What `explain` finds of M patches."""
 
-    Returns the projections (M, 6) of d / L − µ on the derivatives, gains (M,), mean squared residuals (M,) / gain².
-    """
+    left: Array  # (M, 6) projections of what is left of d / L on the derivatives
+    gain: Array  # (M,) L
+    slope: Array  # (M, 2) γ, of the gain per texton unit
+    residual: Array  # (M,) mean of w |d / L − (1 + γ s) µ|² over Σ w
+
+
+def explain(template: Template, solver: Solver, patches: Array, excess: Array) -> Explained:
+    """Fit the light of patches (M, P', C) at the used points, with `excess` (M, 3) blur."""
     d = (patches * solver.root[None, :, None]).reshape(len(patches), -1)
     projected = (d @ solver.basis).astype(np.float64)
     gram = template.gram
-    along = gram[:7, 0] + excess @ gram[7:, :7]  # of the blurred template, on [µ, derivatives]
-    own = along[:, 0] + np.einsum("mi,mi->m", excess, gram[7:, 0] + excess @ gram[7:, 7:])
-    gain = np.maximum((projected[:, 0] + np.einsum("mi,mi->m", excess, projected[:, 7:])) / own, 1e-6)
-    energy = np.maximum(np.einsum("mp,mp->m", d, d, dtype=np.float64) / gain**2 - own, 0)
-    left = projected[:, 1:7] / gain[:, None] - along[:, 1:]
-    return left, gain, energy / (template.weights.sum() * template.values.shape[1])
+    blurred = gram[0] + excess @ gram[_BLUR]  # (M, 12) of the blurred template on all columns
+    normal = np.repeat(light_gram(template)[None], len(patches), 0)
+    normal[:, 0, 0] = blurred[:, 0] + np.einsum("mi,mi->m", excess, blurred[:, _BLUR])
+    normal[:, 0, 1:] = normal[:, 1:, 0] = blurred[:, 10:]
+    right = projected[:, _LIGHT]
+    right[:, 0] += np.einsum("mi,mi->m", excess, projected[:, _BLUR])
+    light = np.linalg.solve(normal, right[..., None])[..., 0]
+    gain = np.maximum(light[:, 0], 1e-6)
+    energy = np.einsum("mp,mp->m", d, d, dtype=np.float64) - np.einsum("mi,mi->m", light, right)
+    left = projected[:, _MOTION] - gain[:, None] * blurred[:, _MOTION] - light[:, 1:] @ gram[10:, _MOTION]
+    slope = np.clip(light[:, 1:] / gain[:, None], -1, 1) / template.radius
+    mass = template.weights.sum() * template.values.shape[1]
+    return Explained(left / gain[:, None], gain, slope, np.maximum(energy / gain**2, 0) / mass)
 
 
 def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Array:
@@ -153,12 +179,13 @@ def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Arr
     return step * np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None] * solver.unit
 
 
-def channel_gains(template: Template, patches: Array, frames: Array) -> Array:
+def channel_gains(template: Template, patches: Array, frames: Array, slope: Array) -> Array:
     """(M, C) gain of each channel of patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2)."""
     _, points, channels = patches.shape
-    second = template.basis[:, 7:].reshape(points, channels, 3)
+    second = template.basis[:, _BLUR].reshape(points, channels, 3)
     root = np.sqrt(template.weights)[:, None]
     model = template.basis[:, 0].reshape(points, channels) + np.einsum("pck,mk->mpc", second, excess_blur(template, frames))
+    model *= (1 + slope @ template.points.T)[..., None]
     seen = np.einsum("mpc,mpc->mc", patches * root, model)
     return np.maximum(seen / np.maximum(np.einsum("mpc,mpc->mc", model, model), 1e-30), 1e-6)
 
@@ -174,13 +201,15 @@ def estimate_spread(template: Template, patches: Array, frames: Array, weights: 
     d = (patches[:, solver.used] * solver.root[None, :, None]).reshape(len(patches), -1)
     projected = (d @ solver.basis).astype(np.float64)
     gram = template.gram
+    other = [k for k in range(len(gram)) if not _BLUR.start <= k < _BLUR.stop]
     left = projected / np.maximum(projected[:, :1] / gram[0, 0], 1e-6) - gram[0]
     wide = blur(frames) - template.mean_blur
     sure = weights * (np.abs(prior * wide).max(1) < _MOST_BLUR)
-    cross = wide @ gram[7:, :7]
-    taken = np.linalg.solve(gram[:7, :7] + 1e-6 * np.diag(np.diag(gram)[:7]), cross.T).T
-    seen = sure @ (np.einsum("mi,mi->m", wide, left[:, 7:]) - np.einsum("mi,mi->m", taken, left[:, :7]))
-    power = sure @ (np.einsum("mi,ij,mj->m", wide, gram[7:, 7:], wide) - np.einsum("mi,mi->m", taken, cross))
+    cross = wide @ gram[_BLUR, other]
+    solid = gram[np.ix_(other, other)]
+    taken = np.linalg.solve(solid + 1e-6 * np.diag(np.diag(solid)), cross.T).T
+    seen = sure @ (np.einsum("mi,mi->m", wide, left[:, _BLUR]) - np.einsum("mi,mi->m", taken, left[:, other]))
+    power = sure @ (np.einsum("mi,ij,mj->m", wide, gram[_BLUR, _BLUR], wide) - np.einsum("mi,mi->m", taken, cross))
     if power <= 0:
         return prior
     found = max(seen / power, 0.05 * prior)
@@ -192,13 +221,11 @@ def estimate_spread(template: Template, patches: Array, frames: Array, weights: 
 
 def registration_step(
     template: Template, patches: Array, frames: Array, damping: float, limit: float = 0.35
-) -> tuple[Array, Array, Array]:
-    """One step for patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2): (steps (M, 6), gains (M,),
-    residuals (M,))."""
+) -> tuple[Array, Explained]:
+    """One step (M, 6) for patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2), and their light."""
     solver = make_solver(template)
-    left, gain, residual = explain(template, solver, patches[:, solver.used], excess_blur(template, frames))
-    step = solve_step(solver, left, np.full(len(patches), damping), limit)
-    return step, gain, residual
+    got = explain(template, solver, patches[:, solver.used], excess_blur(template, frames))
+    return solve_step(solver, got.left, np.full(len(patches), damping), limit), got
 
 
 def compose_step(xy: Array, frames: Array, step: Array) -> tuple[Array, Array]:
@@ -213,7 +240,8 @@ class Registered(NamedTuple):
     xy: Array  # (M, 2)
     frames: Array  # (M, 2, 2)
     gain: Array  # (M,) L_i
-    residual: Array  # (M,) mean of w |d / L − µ|² over Σ w
+    slope: Array  # (M, 2) γ_i, per texton unit
+    residual: Array  # (M,) mean of w |d / L − (1 + γ s) µ|² over Σ w
 
 
 def register(
@@ -225,29 +253,32 @@ def register(
     damping: float = 1e-3,
     limit: float = 0.35,
 ) -> Registered:
-    """Affine registration of M patches to a template, the gain solved for.
+    """Affine registration of M patches to a template, the light solved for.
 
     Levenberg–Marquardt per instance: a step that raises the residual is taken back and damped more; an instance whose
     step is under 1/1000 of the element rests.
     """
     solver = make_solver(template)
     points = template.points[solver.used]
+
+    def look(xy: Array, frames: Array) -> Explained:
+        return explain(template, solver, sample(image, xy, frames, points), excess_blur(template, frames))
+
     xy, frames = xy.copy(), frames.copy()
     lam = np.full(len(xy), damping)
-    left, gain, residual = explain(template, solver, sample(image, xy, frames, points), excess_blur(template, frames))
+    got = look(xy, frames)
     active = np.arange(len(xy))
     for _ in range(steps):
-        step = solve_step(solver, left[active], lam[active], limit)
+        step = solve_step(solver, got.left[active], lam[active], limit)
         new_xy, new_frames = compose_step(xy[active], frames[active], step)
-        new = explain(
-            template, solver, sample(image, new_xy, new_frames, points), excess_blur(template, new_frames)
-        )
-        better = new[2] < residual[active]
+        new = look(new_xy, new_frames)
+        better = new.residual < got.residual[active]
         lam[active] = np.clip(np.where(better, lam[active] * 0.3, lam[active] * 10), 1e-6, 1e3)
         moved = active[better]
         xy[moved], frames[moved] = new_xy[better], new_frames[better]
-        left[moved], gain[moved], residual[moved] = (part[better] for part in new)
+        for old, now in zip(got, new, strict=True):
+            old[moved] = now[better]
         active = active[np.abs(step / solver.unit).max(1) > 1e-3]
         if len(active) == 0:
             break
-    return Registered(xy, frames, gain, residual)
+    return Registered(xy, frames, got.gain, got.slope, got.residual)

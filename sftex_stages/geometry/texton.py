@@ -89,9 +89,16 @@ def seed_members(patches: Array, window: Array) -> Array:
     return np.where(near >= max(cut, 0.5), np.clip(near, 0.0, 1.0) ** 4, 0.0)
 
 
-def weighted_mean(patches: Array, gain: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean and variance over instances of the patches divided by their gain: (P, C), (P,)."""
+def weighted_mean(
+    patches: Array, gain: Array, weights: Array, slope: Array | None = None, points: Array | None = None
+) -> tuple[Array, Array]:
+    """Mean and variance over instances of the patches divided by their gain: (P, C), (P,).
+
+    `slope` (M, 2): the gain is gain (1 + slope · s) at the `points` s (P, 2).
+    """
     share = weights / weights.sum()
+    if slope is not None and points is not None:
+        patches = patches / np.clip(1 + slope.astype(np.float32) @ points.T, 0.25, 4)[..., None]
     flat = patches.reshape(len(patches), -1)
     mean = ((share / gain).astype(np.float32) @ flat).reshape(patches.shape[1:])
     square = ((share / gain**2).astype(np.float32) @ np.square(flat)).reshape(patches.shape[1:])
@@ -168,7 +175,8 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur)
         contrast2 = weighted_contrast(template)
         # M-step for the transforms and gains, E-step for δ, all from the patches in hand
-        step, gain, residual = registration_step(template, patches, frames, _DAMPING)
+        step, light = registration_step(template, patches, frames, _DAMPING)
+        gain, slope, residual = light.gain, light.slope, light.residual
         if iteration == 1:
             noise2 = float(np.median(residual[inlier > 0.3]))
         samples = independent_samples(template)
@@ -185,7 +193,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             keep = inlier > 1e-3
             founders = founders[keep]
             xy, frames, inlier, gain = xy[keep], frames[keep], inlier[keep], gain[keep]
-            residual, step = residual[keep], step[keep]
+            residual, step, slope = residual[keep], step[keep], slope[keep]
             where = where[keep]
             history = [(k, a[keep], b[keep], c[keep]) for k, a, b, c in history]
         if iteration >= settings.affine_iterations:
@@ -207,10 +215,11 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         if iteration in PROGRESS:
             history.append((iteration, xy, frames, inlier))
         # M-step for the appearance
-        patches = sample(image, xy, frames, patch_grid(half, spacing))
+        points = patch_grid(half, spacing)
+        patches = sample(image, xy, frames, points)
         gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
         shares = inlier * _sharpness(frames)
-        values, var = weighted_mean(patches, gain, shares)
+        values, var = weighted_mean(patches, gain, shares, slope, points)
         mean_blur = shares @ blur(frames) / shares.sum()
         weights = domain_weights(values, var, half, 0.1, settings.agreement)
         if (weights > 0).sum() < 9:
@@ -227,6 +236,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
 
 
 _DAMPING = 1e-3
+_FREE_STRAIN = 1.0
 _UPGRADE_EVERY = 3  # iterations on the manifold between metric upgrades
 _SETTLED = 3e-3  # strain of a step that moves no edge of an element by a twentieth of a pixel
 _HALF = 15  # a domain of more grid points is sampled more coarsely: large elements have large detail
@@ -294,11 +304,19 @@ def strain_covariance(template: Template, residual: Array) -> Array:
     From the information of the template (its Hessian with gain and translation marginalised) and each instance's mean
     squared `residual` (M,). Neighbouring samples are not independent, and models are never exact: `calibrate` finds the factor.
     """
-    hessian = marginal_strain(template)
-    # the ridge keeps the free turn of a circular element finite; the symmetric strain does not contain it
-    cov = np.linalg.inv(hessian + 1e-4 * np.trace(hessian) * np.eye(4))
-    fold = np.array([[2.0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 2]])
-    return residual[:, None, None] * (fold @ cov @ fold.T)
+    values, vectors = np.linalg.eigh(marginal_strain(template))
+    # a strain that nothing holds is known to its own size: the free turn of a circle, a stretch along an edge
+    spread = 1 / (np.maximum(values, 0) / residual[:, None].clip(1e-30) + 1 / _FREE_STRAIN**2)
+    fold = np.array([[2.0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 2]]) @ vectors
+    return (fold * spread[:, None, :]) @ fold.T
+
+
+def strain_error(template: Template, residual: float) -> float:
+    """Standard deviation of the symmetric strain in the direction that the element holds least (section 3.1.2).
+
+    `residual` is the mean squared residual of its typical instance, of which eight neighbouring samples count as one.
+    """
+    return float(np.sqrt(np.linalg.eigvalsh(strain_covariance(template, np.array([8 * residual]))[0])[-1]))
 
 
 def tensor_covariance(frames: Array, scale: Array, strain: Array) -> Array:

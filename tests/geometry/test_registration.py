@@ -107,7 +107,7 @@ def test_basis_is_the_derivative_of_sampling(rng):
     template = make_template(values.reshape(n, n, 3), weights, spacing)
     inside = (weights.ravel() > 0) & (np.abs(points) < half * spacing).all(1)
     root = np.sqrt(weights.ravel())[:, None]
-    basis = template.basis.reshape(len(points), 3, 10)
+    basis = template.basis.reshape(len(points), 3, 12)
     assert np.abs(basis[..., 0] - root * values).max() < 1e-6
     # on this grid the template's differences span 2 × spacing: so does the difference of the sampling
     for k in range(6):
@@ -137,7 +137,7 @@ def test_basis_of_a_smooth_element_is_the_derivative_of_its_warp():
     points = patch_grid(half, spacing).astype(float)
     weights = centre_window(half)
     template = make_template(quadratic(points).reshape(n, n, 2), weights, spacing)
-    basis = template.basis.reshape(n * n, 2, 10)
+    basis = template.basis.reshape(n * n, 2, 12)
     inside = (weights.ravel() > 0) & (np.abs(points) < (half - 0.5) * spacing).all(1)
     for k in range(6):
         delta = np.zeros(6)
@@ -153,12 +153,19 @@ def test_basis_of_a_smooth_element_is_the_derivative_of_its_warp():
         assert np.abs(basis[inside, :, 7 + k] - (root * second[k])[inside]).max() < 1e-5
 
 
-def test_marginal_hessian_is_what_is_left_when_the_gain_is_solved_for(rng):
+def light_columns(template):
+    """Columns of gain and slope with the rows of the slope's prior below, (P·C + 2, 3)."""
+    prior = np.zeros((2, 3))
+    prior[:, 1:] = np.sqrt(1e-3 * template.gram[0, 0]) * np.eye(2)
+    return np.concatenate([template.basis[:, [0, 10, 11]], prior])
+
+
+def test_marginal_hessian_is_what_is_left_when_the_light_is_solved_for(rng):
     template = exact_template()
     x = rng.normal(size=6)
-    design = template.basis[:, :7]
-    target = design[:, 1:] @ x
-    left = target - design[:, 0] * (design[:, 0] @ target) / (design[:, 0] @ design[:, 0])
+    target = np.concatenate([template.basis[:, 1:7] @ x, np.zeros(2)])
+    design = light_columns(template)
+    left = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
     assert x @ marginal_hessian(template) @ x == pytest.approx(left @ left, rel=1e-9)
 
 
@@ -188,12 +195,12 @@ def test_recovery_from_exact_samples_has_no_error_of_its_own(rng):
     for _ in range(30):
         warped = np.einsum("mij,pj->mpi", frames, points) + xy[:, None] - where[:, None]
         patches = gains[:, None, None] * texture(np.einsum("mij,mpj->mpi", np.linalg.inv(truth), warped))
-        step, gain, residual = registration_step(template, patches, frames, damping=0.0)
+        step, light = registration_step(template, patches, frames, damping=0.0)
         xy, frames = compose_step(xy, frames, step)
     assert np.abs(xy - where).max() < 1e-5
     assert np.abs(frames - truth).max() < 1e-5
-    assert gain == pytest.approx(gains, rel=1e-5)
-    assert residual.max() < 1e-6
+    assert light.gain == pytest.approx(gains, rel=1e-5)
+    assert light.residual.max() < 1e-6
 
 
 def test_steps_never_raise_the_residual_not_even_from_a_bad_start(rng):
@@ -221,14 +228,31 @@ def test_reported_gain_and_residual_are_those_of_the_reported_frames(rng):
     got = register(image, template, centres + 1, views(rng, m), steps=3)
     solver = make_solver(template)
     patches = sample(image, got.xy, got.frames, template.points)
-    _, gain, residual = explain(template, solver, patches[:, solver.used], np.zeros((m, 3)))
-    assert got.gain == pytest.approx(gain) and got.residual == pytest.approx(residual)
-    w = template.weights[:, None]
+    found = explain(template, solver, patches[:, solver.used], np.zeros((m, 3)))
+    assert got.gain == pytest.approx(found.gain) and got.residual == pytest.approx(found.residual)
+    assert got.slope == pytest.approx(found.slope)
+    design, root = light_columns(template), np.sqrt(template.weights)[:, None]
     for k in range(m):
-        best = (w * patches[k] * template.values).sum() / (w * template.values**2).sum()
-        assert gain[k] == pytest.approx(best, rel=1e-4)
-        direct = (w * (patches[k] / best - template.values) ** 2).sum() / (w.sum() * 3)
-        assert residual[k] == pytest.approx(direct, rel=1e-3, abs=1e-7)
+        target = np.concatenate([(root * patches[k]).ravel(), np.zeros(2)])
+        best, left, _, _ = np.linalg.lstsq(design, target, rcond=None)
+        assert found.gain[k] == pytest.approx(best[0], rel=1e-4)
+        assert found.slope[k] == pytest.approx(best[1:] / best[0] / template.radius, abs=1e-4)
+        direct = left[0] / best[0] ** 2 / (template.weights.sum() * 3)
+        assert found.residual[k] == pytest.approx(direct, rel=1e-3, abs=1e-7)
+
+
+def test_light_that_changes_across_an_element_does_not_move_it(rng):
+    """A shadow's edge: the gain rises by up to a half of itself over the element's radius."""
+    m = 10
+    template = exact_template()
+    points = template.points.astype(float)
+    slope = rng.uniform(-0.5, 0.5, (m, 2)) / template.radius
+    patches = np.repeat(texture(points)[None], m, 0) * (1 + slope @ points.T)[..., None]
+    step, light = registration_step(template, patches, np.repeat(np.eye(2)[None], m, 0), damping=0.0)
+    assert np.abs(step).max() < 5e-3
+    assert light.gain == pytest.approx(np.ones(m), abs=5e-3)
+    assert light.slope == pytest.approx(slope, rel=0.02, abs=1e-4)
+    assert light.residual.max() < 1e-3
 
 
 def test_compose_step_is_the_inverse_composition(rng):
@@ -246,8 +270,8 @@ def test_long_steps_are_shortened_without_turning():
     template = exact_template()
     patches = texture(template.points.astype(float) * 1.6)[None]
     frames = np.eye(2)[None]
-    free, _, _ = registration_step(template, patches, frames, damping=0.0, limit=1e9)
-    short, _, _ = registration_step(template, patches, frames, damping=0.0, limit=0.1)
+    free, _ = registration_step(template, patches, frames, damping=0.0, limit=1e9)
+    short, _ = registration_step(template, patches, frames, damping=0.0, limit=0.1)
     unit = make_solver(template).unit
     assert np.abs(free / unit).max() > 0.1
     assert np.abs(short / unit).max() == pytest.approx(0.1)
@@ -290,7 +314,7 @@ def test_pixels_do_not_make_steep_elements_look_wider(rng):
         template = make_template(values, centre_window(half), 1.0, known, blur(truth).mean(0))
         frames = truth
         for _ in range(20):
-            step, _, _ = registration_step(template, blurred(truth, frames, spread, points), frames, damping=0.0)
+            step, _ = registration_step(template, blurred(truth, frames, spread, points), frames, damping=0.0)
             step[:, 4:] = 0  # the views are centred; shifts would only exercise the sampling
             frames = compose_step(np.zeros((m, 2)), frames, step)[1]
         bent.append(np.abs(np.linalg.solve(truth, frames) - np.eye(2)).max((1, 2)))
