@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from sftex_stages.engine.stage import Arrays, Stage, StageParams
 from sftex_stages.errors import StageError
 from sftex_stages.geometry import (
+    blocks,
     calibration,
     confidence,
     gaussian,
@@ -122,8 +123,9 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     camera's frame; valid (H, W) bool; normal_sigma (H, W) degrees, the root mean square angle expected; NaN where not valid.
     piece (H, W) int32, connected pieces of `valid` from 1, 0 elsewhere: their heights relative to one another are guessed.
     instance/… (N, …), members of usable textons: xy, transform, inlier, irradiance, irradiance_sigma as delivered; normal
-    calibrated, its sign resolved; normal_sigma of the surface there; texton; state, posteriors of {as delivered, the other
-    sign, not from the surface}; sign_margin, nats by which the energy rises if the patch around flips (NaN: not used).
+    calibrated, its sign resolved; normal_sigma, what it is off the surface and the surface off the truth; texton; state,
+    posteriors of {as delivered, the other sign, not from the surface}; sign_margin, nats by which the best rival pattern
+    is worse that differs there (NaN: not used).
     camera "orthographic" or "perspective", with focal_px (inf if orthographic) and principal_point (x, y); vote/…, nats by
     which scale, light and bulge prefer this surface to its mirror image (`sign_votes`).
     energy, −log evidence of the surface; candidate/… and light: see `record`.
@@ -148,7 +150,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     candidates = find(data, coarse, spacing, params.finalists)
     best = candidates[0]
     start = gaussian.gradients(coarse, best.a)
-    margin = np.append(sign_search.margins(data, coarse, best), np.nan)[nodes.member]
+    margin = np.append(sign_search.settle(data, coarse, best, 1)[1], np.nan)[nodes.member]
     choice = choose_camera(instances, nodes, coarse.grid, start, best.smooth, spacing, mask.shape, params)
     camera, height = choice.camera, None
     if camera.bend:
@@ -163,7 +165,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     sign = 1.0 if sum(votes.values()) >= 0 else -1.0
     fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy, camera.stretch(nodes.xy))
     solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, sign * start, best.smooth, height=height)
-    results = outputs(mask, instances, solution, fine, spacing, camera)
+    results = outputs(mask, instances, nodes, solution, fine, spacing, camera)
     results["instance/sign_margin"] = margin.astype(np.float32)
     return results | record(candidates, sign < 0) | {f"vote/{k}": np.array(sign * v) for k, v in votes.items()}
 
@@ -258,6 +260,7 @@ def sign_votes(xy: Float, g: Float, best: sign_search.Candidate, choice: perspec
 def outputs(
     mask: NDArray[np.bool_],
     instances: Instances,
+    nodes: pooling.Nodes,
     solution: refine.Solution,
     field: gaussian.Field,
     spacing: float,
@@ -265,17 +268,22 @@ def outputs(
 ) -> Arrays:
     """Dense maps and instances."""
     table = instances.table
-    index, p = spline.stencil(field.grid, instances.xy, 1, 0)
-    stencil = np.stack((p, spline.stencil(field.grid, instances.xy, 0, 1)[1]), 1)
-    stencil = camera.stretch(instances.xy) @ stencil
+    index, stencil = camera.stencil(field.grid, instances.xy)
     g = np.einsum("npk,nk->np", stencil, solution.a[index])
-    posterior = support.covariance_at(field.grid, solution.factor, instances.xy, camera)
     k, found = instances.trust > 0, instances.calibration
-    errors = confidence.errors(instances.xy[k], found.w[k], instances.covariance[k], g[k], found.common)
-    spread = confidence.spread(errors, instances.xy, g, posterior)
+    residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
+    moved = confidence.influence(field, solution, nodes, residual, instances.texton)
+    inverse = blocks.selected_inverse(solution.factor)
+    errors = confidence.Errors(
+        instances.xy[k], residual[k], chi2[k], found.common, moved, field.grid, inverse, camera
+    )
+    spread = confidence.spread(errors, instances.xy, g)
+    sigma = tensors.angular_error(g, spread)
+    normal = resolve(instances, g)
+    off = np.linalg.norm(normal - tensors.normals(g), axis=1)  # in radians, but for a third order
     state = posterior_states(instances, g, spread)
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
-    maps = support.dense(field, solution.a, solution.factor, mask.shape, instances.xy[seen], spacing, errors, camera)
+    maps = support.dense(field, solution.a, mask.shape, instances.xy[seen], spacing, errors)
     piece = support.pieces(maps["supported"] & mask, spacing**2)
     valid = piece > 0
     nan = np.float32(np.nan)
@@ -289,8 +297,8 @@ def outputs(
         "normal_sigma": np.where(valid, maps["sigma"], nan).astype(np.float32),
         "instance/xy": table["xy"].astype(np.float32),
         "instance/transform": table["transform"].astype(np.float32),
-        "instance/normal": camera.turn(instances.xy, resolve(instances, g)).astype(np.float32),
-        "instance/normal_sigma": np.degrees(tensors.angular_error(g, spread)).astype(np.float32),
+        "instance/normal": camera.turn(instances.xy, normal).astype(np.float32),
+        "instance/normal_sigma": np.degrees(np.hypot(sigma, off)).astype(np.float32),
         "instance/inlier": table["inlier"].astype(np.float32),
         "instance/irradiance": table["irradiance"].astype(np.float32),
         "instance/irradiance_sigma": table["irradiance_sigma"].astype(np.float32),
@@ -335,4 +343,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=3, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=4, params=Params, run=run, inputs=("image", "frontal"))

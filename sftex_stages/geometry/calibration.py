@@ -18,9 +18,8 @@ Int = NDArray[np.integer]
 NEIGHBOURS = 24
 SHEAR = 0.06  # standard deviation of e_k a priori: metric upgrades are off by a few per cent
 FREEDOM = 3.0
-# Textons that had to be sheared to agree are wrong together as well; measured on ten rendered scenes and a photograph, the
-# error in common is 0.4 to 1 of the spread of the shears.
-COMMON_SHARE, COMMON_LEAST = 0.7, 0.004
+# What all textons have wrong together: so many standard errors of the mean shear, were the shears independent.
+COMMON = 2.0
 MEMBERS = 4.0  # instances' worth of prior that a texton's noise is as stated
 
 
@@ -122,6 +121,9 @@ def calibrate(
         relative = trust * robust * ((mean - current) ** 2).sum(1) / (variance + spread) / 2
         mass = np.bincount(texton, trust, count)
         noise = (np.bincount(texton, relative, count) + MEMBERS) / (mass + MEMBERS)
+    # A texton that no other one saw may have any shear; the others' shears show how large they are.
+    unseen = np.bincount(texton, trust * ~lonely, count) == 0
+    variance_of_shear = np.where(unseen, (SHEAR / COMMON) ** 2, (e**2).sum(1) / 2)
     total = np.bincount(texton, trust, count) / noise
-    shared = COMMON_SHARE * np.sqrt(total @ (e**2).sum(1) / 2 / total.sum())
-    return Calibration(e, noise, current, robust, float(np.hypot(COMMON_LEAST, shared)))
+    common = COMMON * np.sqrt(total**2 @ variance_of_shear) / total.sum()
+    return Calibration(e, noise, current, robust, float(common))

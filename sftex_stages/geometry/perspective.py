@@ -49,6 +49,12 @@ class Camera:
         k = np.eye(2) + (1 / cosine - 1)[:, None, None] * u[:, :, None] * u[:, None, :]
         return k / cosine[:, None, None]
 
+    def stencil(self, grid: spline.Grid, xy: Float) -> tuple[NDArray[np.integer], Float]:
+        """Coefficient numbers (N, 16) and weights (N, 2, 16) of the slope relative to the ray at `xy` (N, 2) px."""
+        index, p = spline.stencil(grid, xy, 1, 0)
+        both = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
+        return index, both if self.bend == 0 else self.stretch(xy) @ both
+
     def slopes(self, xy: Float, g: Float) -> Float:
         """K g (…, 2) of gradients g (…, 2) at `xy` (…, 2)."""
         u, cosine = self.rays(xy)

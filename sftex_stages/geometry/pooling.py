@@ -17,13 +17,15 @@ FREEDOM = 3.0
 
 @dataclass(frozen=True)
 class Nodes:
-    """`xy` (M, 2), `w` (M, 2) with `covariance` (M, 2, 2), `weight` (M,) ≤ 1 believed share, `member` (N,) node or −1."""
+    """`xy` (M, 2), `w` (M, 2) with `covariance` (M, 2, 2), `weight` (M,) ≤ 1 believed share, `member` (N,) node or −1, `share`
+    (N, 2, 2) that an instance's w has in its node's: they add up to the identity."""
 
     xy: Float
     w: Float
     covariance: Float
     weight: Float
     member: Int
+    share: Float
 
 
 def cells(xy: Float, cell: float) -> Int:
@@ -64,7 +66,9 @@ def pool(xy: Float, w: Float, covariance: Float, trust: Float, cell: float, floo
     spread = inverse * np.maximum(scatter, 1)[:, None, None] + floor**2 * np.eye(2)
     member = np.full(len(xy), -1, np.int64)
     member[used] = cellnumber
-    return Nodes(centre, mean, spread, np.minimum(total / number, 1), member)
+    share = np.zeros((len(xy), 2, 2))
+    share[used] = inverse[cellnumber] @ (strength[:, None, None] * precision)
+    return Nodes(centre, mean, spread, np.minimum(total / number, 1), member, share)
 
 
 def average(value: Float, variance: Float, nodes: Nodes, trust: Float, floor: float) -> tuple[Float, Float]:

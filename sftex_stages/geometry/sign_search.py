@@ -2,8 +2,9 @@
 
 Every smoothness of a ladder, smooth to rough, anneals all starts (leading eigenvectors, the paper's cylinder in four
 directions, leaning planes, a bowl, lights from six azimuths), with and without shading, moves whole regions, and hands its
-patterns on as starts of the next. The best distinct patterns are then judged by their evidence, each with its own best
-smoothness and noise and with outliers let go, so that patterns found with different settings compare.
+patterns on as starts of the next. The best distinct patterns then flip regions of every size (`sign_regions.py`) and are
+judged by their evidence, each with its own best smoothness and noise and with outliers let go, so that patterns found
+with different settings compare.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, shading, signs, surface_em
+from sftex_stages.geometry import blocks, gaussian, shading, sign_regions, signs, surface_em
 from sftex_stages.geometry.refine import climb
 
 Float = NDArray[np.floating]
@@ -235,8 +236,36 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
         pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
     first = [judge(data, f, s, smooth, 1.0, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
-    last = [judge(data, f, x.s, x.smooth, x.noise, 2, x.origin) for x in first[:finalists]]
+    moved = [settle(data, f, x)[0] for x in first[:finalists]]
+    last = [
+        judge(data, f, moved[k], first[k].smooth, first[k].noise, 2, first[k].origin)
+        for k in distinct(np.stack(moved, 1), data.trust, 0.995)
+    ]
     return sorted(last, key=lambda x: -x.evidence) + first[finalists:]
+
+
+def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) -> tuple[Float, Float]:
+    """The signs (N,) of `found` after flips of regions of all sizes, as long as one helps; and how sure each is (N,).
+
+    Energies are those of its own smoothness, noise and outliers. How sure: the nats by which the best rival pattern is worse
+    that differs there (`sign_regions.py`).
+    """
+    weight = np.linalg.inv(data.covariance) * (found.inside / found.noise)[:, None, None]
+    c = signs.coupling(f, data.d, weight, found.smooth)
+    pairs, s, lit = neighbours(data.xy), found.s, np.ones(1, bool)
+    for _ in range(rounds):
+        bias = bias_of(data, s[:, None], lit, [None])[:, 0]
+        regions, rise = sign_regions.rivals(c, data.d, s, bias, pairs)
+        best = int(rise.argmin())
+        if rise[best] > -0.1:
+            break
+        s = s.copy()
+        s[regions[best]] *= -1
+        s = signs.descend(c, s[:, None], bias[:, None])[:, 0]
+    # What did not fit the former pattern had no say, and no energy of its own: it follows the surface.
+    g = gaussian.gradients(f, signs.surface_of(c, s))
+    lost = (found.inside < 0.5 * data.trust) & ((data.d * g).sum(1) * s < 0)
+    return np.where(lost, -s, s), sign_regions.margins(regions, rise, len(s))
 
 
 def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list[Candidate]:
@@ -249,23 +278,6 @@ def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list
         s = np.where(result.state[:, 0] < result.state[:, 1], -1.0, 1.0)
         found.append(judge(data, f, s, smooth, 1.0, 1, f"em, cylinder {45 * k}°"))
     return sorted(found, key=lambda x: -x.evidence)[:finalists]
-
-
-def margins(data: Data, f: gaussian.Field, best: Candidate) -> Float:
-    """How sure the signs are, patch by patch: nats (N,) by which the energy would rise if a node's whole patch flipped.
-
-    A patch is a connected region of one slope direction (`patches`); the global mirror image is another matter.
-    """
-    weight = np.linalg.inv(data.covariance) * (best.inside / best.noise)[:, None, None]
-    c = signs.coupling(f, data.d, weight, best.smooth)
-    label = patches(data, neighbours(data.xy), 0.15)
-    member = np.zeros((len(best.s), int(label.max()) + 1))
-    member[np.arange(len(best.s)), label] = best.s
-    k = member.T @ signs.product(c, member)
-    gain = 2 * (k.sum(1) - np.diag(k))
-    if data.shading is not None and best.light is not None:
-        gain += 2 * member.T @ (SAY_OF_SHADING * data.trust * shading.pull(data.shading, best.light))
-    return gain[label]
 
 
 def shortlist(

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
-from sftex_stages.geometry import blocks, confidence, gaussian, perspective, spline, tensors
+from sftex_stages.geometry import confidence, gaussian, spline, tensors
 
 Float = NDArray[np.floating]
 
@@ -48,28 +48,27 @@ def surrounded(xy: Float, at: Float, count: int = 24) -> NDArray[np.bool_]:
 def dense(
     f: gaussian.Field,
     a: Float,
-    factor: blocks.Factor,
     shape: tuple[int, int],
     xy: Float,
     spacing: float,
     errors: confidence.Errors,
-    camera: perspective.Camera = perspective.ORTHOGRAPHIC,
 ) -> dict[str, NDArray]:
     """Maps of an image of `shape` (H, W): `height` px, `normals` (H, W, 3), `sigma` degrees, `supported`.
 
-    `xy` (N, 2) are the measurements believed, `errors` what the instances show of them. Height and gradient
+    `xy` (N, 2) are the measurements believed, `errors` what is known of the surface's errors. Height and gradient
     are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster and interpolated.
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
     g = np.stack([spline.evaluate(f.grid, a, columns, rows, *d) for d in ((1, 0), (0, 1))], -1)
     pixels = np.stack(np.meshgrid(columns, rows), -1)
+    camera = errors.camera
     g = camera.slopes(pixels, g)
     pace = max(spacing / 3, 1.0)
     at_x, at_y = (np.linspace(0, n - 1, max(int(np.ceil((n - 1) / pace)) + 1, 2)) for n in (shape[1], shape[0]))
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
     slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
     slope = camera.slopes(points, slope)
-    spread = confidence.spread(errors, points, slope, covariance_at(f.grid, factor, points, camera))
+    spread = confidence.spread(errors, points, slope)
     sigma = np.degrees(tensors.angular_error(slope, spread)).reshape(len(at_y), len(at_x))
     height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(f.grid, xy)
@@ -97,16 +96,6 @@ def pieces(valid: NDArray[np.bool_], least: float) -> NDArray[np.int32]:
     new = np.zeros(count, np.int32)
     new[1 + order] = np.where(area[order] >= least, np.arange(1, count), 0)
     return new[label]
-
-
-def covariance_at(
-    grid: spline.Grid, factor: blocks.Factor, xy: Float, camera: perspective.Camera = perspective.ORTHOGRAPHIC
-) -> Float:
-    """Posterior covariance (N, 2, 2) of the slope relative to the ray at any `xy` (N, 2) px."""
-    index, p = spline.stencil(grid, xy, 1, 0)
-    stencil = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
-    stencil = camera.stretch(xy) @ stencil
-    return blocks.covariance(blocks.selected_inverse(factor), index, stencil, stencil)
 
 
 def _enlarge(coarse: Float, shape: tuple[int, int]) -> Float:
