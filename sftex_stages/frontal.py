@@ -189,7 +189,8 @@ def adopt(detect: Mapping[str, Any], members: Indices, found: Indices, reach: fl
     descriptor, kind = detect["descriptor"], detect["kind"]
     size = np.log(np.abs(np.linalg.det(detect["frame"].astype(np.float64)))) / 2
     own = members[found]
-    distance = np.linalg.norm(descriptor - descriptor[own].mean(0), axis=1)
+    centre = descriptor[own].mean(0)
+    distance = np.einsum("nk,nk->n", descriptor, descriptor) - 2 * descriptor @ centre  # squared, but for a constant
     near = (distance < np.quantile(distance[own], reach)) & (kind == kind[members[0]])
     near &= np.abs(size - np.median(size[own])) < np.log(2.0)
     near[members] = False

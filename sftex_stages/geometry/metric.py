@@ -98,7 +98,7 @@ def metric_upgrade(
     are nearly metric already. For a circular element its M up to size is given by `circle` (`circle_metric`): equal major
     axes then fix the size alone.
     """
-    base = float(np.exp(np.median(np.log(np.linalg.svd(frames, compute_uv=False)[:, 0]))))
+    base = float(np.sqrt(np.median(leading_eigenpair(frames @ np.swapaxes(frames, 1, 2))[0])))
     g = frames / base
     shape = np.eye(3) if circle is None else np.array([[circle[0, 0], circle[0, 1], circle[1, 1]]])
     starts: list[Array] = [np.eye(2)]

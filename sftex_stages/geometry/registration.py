@@ -230,7 +230,9 @@ def registration_step(
 
 def compose_step(xy: Array, frames: Array, step: Array) -> tuple[Array, Array]:
     """Inverse composition: the template's warp s → (I + D) s + t moves an instance to frames (I + D)⁻¹, xy − frames' t."""
-    frames = frames @ np.linalg.inv(np.eye(2) + step[:, :4].reshape(-1, 2, 2))
+    a, b, c, d = 1 + step[:, 0], step[:, 1], step[:, 2], 1 + step[:, 3]
+    inverse = np.stack([d, -b, -c, a], -1) / (a * d - b * c)[:, None]
+    frames = frames @ inverse.reshape(-1, 2, 2)
     return xy - np.einsum("mij,mj->mi", frames, step[:, 4:]), frames
 
 

@@ -238,7 +238,8 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
 _DAMPING = 1e-3
 _FREE_STRAIN = 1.0
 _UPGRADE_EVERY = 3  # iterations on the manifold between metric upgrades
-_SETTLED = 3e-3  # strain of a step that moves no edge of an element by a twentieth of a pixel
+
+_SETTLED = 1e-2  # strain of a step that moves no edge of an element by a twentieth of a pixel
 _HALF = 15  # a domain of more grid points is sampled more coarsely: large elements have large detail
 _CIRCLE = 0.15  # a turn that costs less than this share of the next strain is none
 _ROUND = 1.2  # a circle may fit this much worse than a free stretch, which has two numbers more
@@ -294,8 +295,8 @@ def weighted_contrast(template: Template) -> float:
 
 def _sharpness(frames: Array) -> Array:
     """Steep instances show less detail: weight by cos σ."""
-    sigma = np.linalg.svd(frames, compute_uv=False)
-    return sigma[:, 1] / np.maximum(sigma[:, 0], 1e-9)
+    l1, l2, _ = leading_eigenpair(frames @ np.swapaxes(frames, 1, 2))
+    return np.sqrt(np.maximum(l2, 0) / np.maximum(l1, 1e-18))
 
 
 def strain_covariance(template: Template, residual: Array) -> Array:
@@ -340,6 +341,13 @@ def with_tensor(frames: Array, tensor: Array, scale: Array) -> Array:
     v = np.stack([-u[:, 1], u[:, 0]], -1)
     minor = np.sqrt(np.clip(l2, 0.01, 1.0))
     root = u[:, :, None] * u[:, None, :] + minor[:, None, None] * v[:, :, None] * v[:, None, :]
-    p, _, qt = np.linalg.svd(root @ frames)
-    turn = p @ qt
-    return scale[:, None, None] * (root @ turn)
+    return scale[:, None, None] * (root @ nearest_turn(root @ frames))
+
+
+def nearest_turn(m: Array) -> Array:
+    """The rotations or reflections (M, 2, 2) nearest to `m` (M, 2, 2): their polar factors."""
+    side = np.where(m[:, 0, 0] * m[:, 1, 1] >= m[:, 0, 1] * m[:, 1, 0], 1.0, -1.0)
+    c, s = m[:, 0, 0] + side * m[:, 1, 1], m[:, 1, 0] - side * m[:, 0, 1]
+    length = np.maximum(np.hypot(c, s), 1e-30)
+    c, s = c / length, s / length
+    return np.stack([c, -side * s, s, side * c], -1).reshape(-1, 2, 2)

@@ -16,6 +16,7 @@ from sftex_stages.geometry.texton import (
     hold_to_manifold,
     information_centre,
     marginal_strain,
+    nearest_turn,
     posterior,
     seed_members,
     strain_covariance,
@@ -242,6 +243,13 @@ def test_strain_covariance_is_that_of_white_noise(rng):
 
 
 # the manifold
+
+
+def test_nearest_turn_is_the_polar_factor(rng):
+    m = rng.normal(size=(200, 2, 2))
+    p, _, qt = np.linalg.svd(m)
+    assert np.abs(nearest_turn(m) - p @ qt).max() < 1e-9
+    assert (np.linalg.det(m) < 0).any()
 
 
 def random_frames(rng, n, strain=0.05):
