@@ -80,7 +80,7 @@ def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
         without a usable texton, or with fewer than three instances to believe in.
     """
     names = ["xy", "transform", "tensor", "tensor_cov", "normal", "inlier", "irradiance", "irradiance_sigma"]
-    names.append("log_scale_sigma")
+    names += ["irradiance_rgb", "log_scale_sigma"]
     parts = [(k, f) for k, f in enumerate(frontal) if bool(f["usable"]) and len(f["xy"])]
     if not parts:
         raise StageError(
@@ -122,7 +122,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     height (H, W) px toward the camera, mean 0 (perspective: px as they are at the distance f); normals (H, W, 3) in the
     camera's frame; valid (H, W) bool; normal_sigma (H, W) degrees, the root mean square angle expected; NaN where not valid.
     piece (H, W) int32, connected pieces of `valid` from 1, 0 elsewhere: their heights relative to one another are guessed.
-    instance/… (N, …), members of usable textons: xy, transform, inlier, irradiance, irradiance_sigma as delivered; normal
+    instance/… (N, …), members of usable textons: xy, transform, inlier, irradiance (and _rgb, _sigma) as delivered; normal
     calibrated, its sign resolved; normal_sigma, what it is off the surface and the surface off the truth; texton; state,
     posteriors of {as delivered, the other sign, not from the surface}; sign_margin, nats by which the best rival pattern
     is worse that differs there (NaN: not used).
@@ -301,6 +301,7 @@ def outputs(
         "instance/normal_sigma": np.degrees(np.hypot(sigma, off)).astype(np.float32),
         "instance/inlier": table["inlier"].astype(np.float32),
         "instance/irradiance": table["irradiance"].astype(np.float32),
+        "instance/irradiance_rgb": table["irradiance_rgb"].astype(np.float32),
         "instance/irradiance_sigma": table["irradiance_sigma"].astype(np.float32),
         "instance/texton": table["texton"],
         "instance/state": state.astype(np.float32),
@@ -343,4 +344,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=4, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=5, params=Params, run=run, inputs=("image", "frontal"))

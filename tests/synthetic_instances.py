@@ -42,6 +42,7 @@ def instances_of(gradient, seed=0, noise=0.0, textons=3, light=None):
                 "normal_sigma": np.full(size, 1, np.float32),
                 "inlier": np.full(size, 0.98, np.float32),
                 "irradiance": (light[m] * (1 + 0.5 * k)).astype(np.float32),
+                "irradiance_rgb": np.repeat((light[m] * (1 + 0.5 * k))[:, None], 3, 1).astype(np.float32),
                 "irradiance_sigma": np.full(size, 0.005, np.float32),
             }
         )
