@@ -67,7 +67,9 @@ def result_files(folder):
 
 
 def listing(*folders):
-    return {p: p.stat().st_mtime_ns for folder in folders for p in folder.rglob("*") if not p.name.startswith("fuzzed.")}
+    return {
+        p: p.stat().st_mtime_ns for folder in folders for p in folder.rglob("*") if not p.name.startswith("fuzzed.")
+    }
 
 
 def test_fuzzed_results(tmp_path, monkeypatch, rng, measured):

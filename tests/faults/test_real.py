@@ -1,26 +1,39 @@
-"""The real pipeline on a real file: the same bytes with one and two jobs, in different folders; little time lost."""
+"""The real pipeline on a real file: killed in every stage; the same bytes with one and two jobs; little time lost."""
 
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
-from faults import LONG
+from faults import LONG, said, wait_until
+
+from sftex_stages import pipeline
 
 EXAMPLES = Path(__file__).parents[2] / "data" / "examples"
+COMMAND = [sys.executable, "-m", "sftex_stages.cli", "run", "in", "--json"]
+ENV = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
 pytestmark = pytest.mark.skipif(not LONG, reason="long set: make faults")
 
 
+def start(folder, out, jobs):
+    """A run of the whole pipeline in a process group of its own."""
+    command = [*COMMAND, "--out", out, "--jobs", str(jobs)]
+    return subprocess.Popen(
+        command, cwd=folder, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
 def reconstruct(folder, out, jobs):
-    """The JSON of a run of the whole pipeline."""
-    command = [sys.executable, "-m", "sftex_stages.cli", "run", "in", "--out", out, "--jobs", str(jobs), "--json"]
-    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=3000)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    """The JSON of such a run."""
+    process = start(folder, out, jobs)
+    answer, errors = said(process, 3000)
+    assert process.returncode == 0, errors
+    return json.loads(answer)
 
 
 def content(out):
@@ -29,8 +42,13 @@ def content(out):
     return {str(path.relative_to(out)): path.read_bytes() for path in found}
 
 
-def test_same_bytes_and_little_overhead(tmp_path, measured):
-    picture = min(EXAMPLES.glob("*.png"), key=lambda path: path.stat().st_size)
+@pytest.fixture(scope="module")
+def picture():
+    """The example with the smallest file."""
+    return min(EXAMPLES.glob("*.png"), key=lambda path: path.stat().st_size)
+
+
+def test_same_bytes_and_little_overhead(tmp_path, picture, measured):
     for name in ("one", "two"):
         (tmp_path / name / "in").mkdir(parents=True)
         shutil.copy(picture, tmp_path / name / "in")
@@ -49,3 +67,34 @@ def test_same_bytes_and_little_overhead(tmp_path, measured):
         f"{first['seconds']:.1f} s, of which {lost:.1f} s ({100 * lost / first['seconds']:.1f} %) are not in stages; "
         f"cached: {again:.2f} s",
     )  # fmt: skip
+
+
+def test_killed_in_every_stage(tmp_path, picture, rng, measured):
+    """A quarter of the example, killed thrice in every stage: each run goes on from what the one before left."""
+    times = 3
+    pixels = cv2.imread(str(picture))
+    (tmp_path / "in").mkdir()
+    height, width = pixels.shape[:2]
+    assert cv2.imwrite(str(tmp_path / "in" / "a.png"), pixels[height // 4 : -height // 4, width // 4 : -width // 4])
+    whole = reconstruct(tmp_path, "clean", 2)
+    names = [*(stage.name for stage in pipeline.PIPELINE), "outputs"]
+    seconds = {name: stage["seconds"] for name, stage in whole["images"][0]["stages"].items()}
+    store = tmp_path / "out" / ".store"
+    early = 0
+    for before, stage in zip([None, *names], names, strict=False):
+        for number in range(times):
+            process = start(tmp_path, "out", 2)
+            assert wait_until(
+                lambda before=before: before is None or any((store / before).glob("??/*.json")), seconds=600
+            )
+            try:  # while the stage is at work, if it is not done yet
+                process.wait(rng.uniform(0, min(30.0, 2 + seconds[stage])))
+            except subprocess.TimeoutExpired:
+                early += 1
+            os.killpg(process.pid, signal.SIGKILL) if number % 2 else process.kill()
+            said(process, 60)
+    reconstruct(tmp_path, "out", 2)
+    expected, found = content(tmp_path / "clean"), content(tmp_path / "out")
+    assert [name for name in expected if found.get(name) != expected[name]] == [] and found.keys() == expected.keys()
+    assert early > len(names)
+    measured("kill −9 in every stage of the real pipeline, one after another", early, "then equal to a clean run")
