@@ -30,6 +30,7 @@ PATIENCE = 6.0  # seconds without a byte from the child
 _MOST_SECONDS = 600  # of work on one file, should nobody be left to lose patience
 _SLAB = 16 << 20  # bytes sent at a time
 _MOST_HEADER = 64 << 20
+_DEEPEST = 8  # groups in groups
 _FAILED = (1 << 64) - 1  # in place of a slab's length
 
 
@@ -59,6 +60,29 @@ def read_hdf5(
     `what`: kind of file, for messages. `check(attributes, declared)` is called before any data is read and may raise.
     Text comes as '<U…'. Raises InputError, which names the file, for everything that is wrong with it.
     """
+    return _guarded(path, what, names, max_bytes, check)
+
+
+def survey_hdf5(path: Path, max_bytes: int = 8 << 30, what: str = "HDF5") -> dict[str, Declared]:
+    """What a file says of all its datasets; none is read. InputError if anything in it is not a plain dataset."""
+    found: dict[str, Declared] = {}
+
+    def note(attributes: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
+        found.update(declared)
+        raise _Enough
+
+    with contextlib.suppress(_Enough):
+        _guarded(path, what, None, max_bytes, note)
+    return found
+
+
+class _Enough(Exception):
+    """Nothing more is wanted of this file."""
+
+
+def _guarded(
+    path: Path, what: str, names: Sequence[str] | None, max_bytes: int, check: Check | None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if not path.is_file():
         raise InputError(f"{path}: no such {what} file")
     with _lock:
@@ -98,9 +122,9 @@ class _Server:
         self.selector.register(self.out, selectors.EVENT_READ)
 
     def read(
-        self, path: Path, names: Sequence[str], max_bytes: int, check: Check | None
+        self, path: Path, names: Sequence[str] | None, max_bytes: int, check: Check | None
     ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        request = {"path": str(path.absolute()), "names": list(names), "max_bytes": max_bytes}
+        request = {"path": str(path.absolute()), "names": names and list(names), "max_bytes": max_bytes}
         self.idle = False
         try:
             self._say(json.dumps(request).encode() + b"\n")
@@ -109,7 +133,7 @@ class _Server:
             if check:
                 try:
                     check(header["attributes"], declared)
-                except InputError:
+                except (InputError, _Enough):
                     self._say(b"-")
                     self._json(path)
                     raise
@@ -259,7 +283,7 @@ def _answer(request: dict[str, Any]) -> Iterator[bytes]:
     path = request["path"]
     with h5py.File(path, "r", locking=False) as file:
         found: dict[str, Any] = {}
-        for name in request["names"]:
+        for name in _everything(file) if request["names"] is None else request["names"]:
             node = _dataset(file, name)
             if node is None:
                 continue
@@ -304,6 +328,19 @@ def _dataset(file: Any, name: str) -> Any:
     if not isinstance(node, h5py.Dataset):
         raise Refused(f"{name} is not a dataset; such files are not read")
     return node
+
+
+def _everything(group: Any, prefix: str = "", depth: int = 0) -> Iterator[str]:
+    """Names of all that is no group, whatever it is."""
+    import h5py
+
+    if depth > _DEEPEST:  # a group may contain itself
+        raise Refused(f"{prefix} lies too deep; such files are not read")
+    for name in group:
+        if isinstance(group.get(name, getlink=True), h5py.HardLink) and isinstance(group[name], h5py.Group):
+            yield from _everything(group[name], f"{prefix}{name}/", depth + 1)
+        else:
+            yield prefix + name
 
 
 def _dtype(name: str, node: Any) -> str:

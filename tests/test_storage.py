@@ -5,17 +5,19 @@ import io
 import json
 import os
 import re
+import shutil
 import tarfile
 import time
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import toy_stages
 from test_cli import here, sftex, states  # noqa: F401  the fixtures of the command line
 
 from sftex_stages import cli, pipeline, storage
-from sftex_stages.engine import keys
+from sftex_stages.engine import keys, ledger
 
 pytestmark = pytest.mark.usefixtures("here")
 ALL = ["image", "detect", "cluster", "frontal", "surface", "irradiance", "chart", "outputs"]
@@ -268,6 +270,101 @@ def test_bad_archives_leave_no_trace(here, sftex, done, change, words):  # noqa:
     assert code == cli.USAGE and out == "" and "Traceback" not in err
     assert re.search(words, err), err
     assert {p.name for p in set(here.rglob("*")) - before} <= {"new", ".store", "tmp"}
+
+
+def reseal(source, target, change):
+    """The folder of a run with one file changed by `change(path)`, and every hash made right: as somebody bad would."""
+    shutil.copytree(source, target)
+    record = ledger.unseal((target / "run.json").read_bytes())
+    for label, item in record["items"].items():
+        for stage, many in item["keys"].items():
+            for key in many:
+                path = target / "store" / stage / key[:2] / f"{key}.json"
+                receipt = json.loads(path.read_text())
+                receipt.pop("checksum")
+                change(stage, path.with_suffix(".h5"), receipt)
+                if receipt["artefact"]:
+                    content = path.with_suffix(".h5").read_bytes()
+                    receipt["artefact"] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+                for name in receipt.get("files", {}):
+                    content = (target / "results" / label / name).read_bytes()
+                    receipt["files"][name] = hashlib.sha256(content).hexdigest()
+                path.write_text(json.dumps({**receipt, "checksum": keys.digest(receipt)}))
+    names = [line.split("  ")[1] for line in (target / "SHA256SUMS").read_text().splitlines()]
+    lines = [f"{hashlib.sha256((target / name).read_bytes()).hexdigest()}  {name}\n" for name in names]
+    (target / "SHA256SUMS").write_text("".join(lines))
+
+
+def hdf5(act):
+    def change(stage, artefact, receipt):
+        if stage == "surface":
+            with h5py.File(artefact, "r+") as file:
+                act(file)
+
+    return change
+
+
+def soft(file):
+    file["more"] = h5py.SoftLink("/instance/xy")
+
+
+def external_link(file):
+    file["more"] = h5py.ExternalLink("/etc/passwd", "/")
+
+
+def external_storage(file):
+    file.create_dataset("more", (9,), "u1", external=[("/etc/passwd", 0, 9)])
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout((4,), "u1")
+    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (4,))
+    file.create_virtual_dataset("more", layout)
+
+
+def absurd(file):
+    file.create_dataset("more", (10**13,), "u1", chunks=(10**6,), compression=1)
+
+
+def ring(file):
+    file["more/again"] = file["/"]
+
+
+def lie(name, value):
+    def change(stage, artefact, receipt):
+        if stage == "cluster":
+            receipt[name] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (hdf5(soft), "link"), (hdf5(external_link), "link"), (hdf5(external_storage), "another file"),
+        (hdf5(virtual), "another file"), (hdf5(absurd), "declares 9313.2 GiB"), (hdf5(ring), "too deep"),
+        (hdf5(lambda file: file.create_dataset("more", data=1)), "other arrays than its receipt"),
+        (lambda stage, artefact, receipt: stage == "surface" and artefact.write_bytes(b"no HDF5"), "not a whole HDF5 file"),
+        (lie("scalars", {"count": []}), r"receipt of cluster: scalars\.count"), (lie("software", []), "cluster: software"),
+        (lie("artefact", None), "do not agree"),
+    ],
+)  # fmt: skip
+def test_archives_with_right_hashes_and_bad_content_are_refused(here, sftex, done, change, words):  # noqa: F811
+    sftex("archive", "last", "-o", "whole")
+    reseal(here / "whole", here / "same", lambda *args: None)
+    assert sftex("restore", "same", "--out", "new")[0] == 0  # what was changed is what is refused
+    reseal(here / "whole", here / "bad", change)
+    code, _, err = sftex("restore", "bad", "--out", "other")
+    assert code == cli.USAGE and re.search(words, err) and "bad: " in err, err
+    assert not list((here / "other").glob(".store/*/??/*")) and not list((here / "other" / ".store" / "tmp").iterdir())
+
+
+def test_restore_replaces_no_results_of_another_run(here, sftex, done):  # noqa: F811
+    sftex("archive", "last", "-o", "run.tar")
+    result = here / "outputs" / "a" / "result.h5"
+    result.write_bytes(b"mine")
+    code, _, err = sftex("restore", "run.tar")
+    assert code == cli.USAGE and "outputs/a/result.h5: differs" in err and result.read_bytes() == b"mine"
 
 
 def test_cut_and_damaged_archives_are_refused(here, sftex, done):  # noqa: F811

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from sftex_stages import images
+from sftex_stages.engine.hdf5 import encode
 from sftex_stages.engine.stage import Stage, StageParams
 from sftex_stages.errors import StageError
 
@@ -59,5 +60,6 @@ PIPELINE = (
 
 def deliver(folder, arrays, meta):
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "result.h5").write_text(f"{arrays['irradiance']['map'].tolist()} {meta}")
+    content = encode({"map": arrays["irradiance"]["map"], "meta": np.array(str(meta))})
+    (folder / "result.h5").write_bytes(content)
     return [folder / "result.h5"]

@@ -8,7 +8,8 @@
     results/<item>/<file>                what was delivered
 
 Restoring takes nothing on trust: only plain files of exactly these names, each listed and right by its hash, each
-receipt in agreement with its own key. What is refused leaves no trace.
+receipt in agreement with its own key, each artefact plain HDF5 that holds what its receipt says. What is refused leaves
+no trace, and nothing replaces results of another run.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import InputError, StoreError
-from . import keys, ledger, runs
+from . import foreign, keys, ledger, runs
 from .store import RESERVED, Store, read_receipt
 
 _SUMS = "SHA256SUMS"
@@ -123,7 +124,7 @@ def restore(store: Store, out: Path, source: Path) -> tuple[str, int]:
     try:
         staging.mkdir()
         staged = _stage(source, staging)
-        run = _check(source, staged)
+        run = _check(source, staged, out)
         return run, _place(store, out, staged, run)
     except (tarfile.TarError, EOFError, UnicodeError) as error:
         raise InputError(f"{source}: not a whole archive of a run ({error}); copy it again") from error
@@ -202,8 +203,8 @@ def _parse_sums(source: Path, content: bytes) -> dict[str, str]:
     return sums
 
 
-def _check(source: Path, staged: dict[str, tuple[Path, str]]) -> str:
-    """The run's id; InputError if record, receipts, artefacts and results do not belong together."""
+def _check(source: Path, staged: dict[str, tuple[Path, str]], out: Path) -> str:
+    """The run's id; InputError if its parts do not belong together, are not plain, or would replace other results."""
     wanted = {"run.json", "config.yaml"}
     try:
         document = ledger.unseal(staged["run.json"][0].read_bytes())
@@ -216,17 +217,28 @@ def _check(source: Path, staged: dict[str, tuple[Path, str]]) -> str:
                     receipt, _ = read_receipt(staged[f"{base}.json"][0])
                     if receipt["key"] != key or keys.digest(receipt["identity"]) != key:
                         raise ValueError(f"{base}.json belongs to another job")
+                    foreign.check_receipt(receipt, stage)
                     files = {f"results/{label}/{name}": sha256 for name, sha256 in receipt.get("files", {}).items()}
                     if receipt["artefact"] is not None:
                         files[f"{base}.h5"] = receipt["artefact"]["sha256"]
                     if any(staged[name][1] != sha256 for name, sha256 in files.items()):
                         raise ValueError(f"{base}.json tells of other files")
+                    for member in (member for member in files if member.endswith(".h5")):
+                        foreign.check_hdf5(
+                            staged[member][0], member, receipt["arrays"] if receipt["artefact"] else None
+                        )
                     wanted |= {f"{base}.json", *files}
         name = keys.digest(document)[:12]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{source}: its parts do not belong together ({error}); not restored") from error
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
     if extra := staged.keys() - wanted:
         raise InputError(f"{source}: {min(extra)} does not belong to the run; not restored")
+    for result in (entry for entry in staged if entry.startswith("results/")):
+        place = out / result.removeprefix("results/")
+        if place.is_file() and keys.file_sha256(place) != staged[result][1]:
+            raise InputError(f"{place}: differs from the archive's and would be lost; restore into another --out")
     return name
 
 

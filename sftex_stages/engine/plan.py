@@ -261,7 +261,7 @@ def _parts(stage: Stage, plan: Plan) -> Sequence[int | None]:
     if stage.fan_out is None:
         return [None]
     receipt = plan.steps[stage.fan_out].done[None]
-    count = int(receipt["scalars"]["count"])
+    count = receipt["scalars"].get("count", -1)
     if not 0 <= count <= _MOST_PARTS:
         raise StoreError(f"{stage.fan_out} of {plan.item.name} claims {count} parts; at most {_MOST_PARTS} are planned")
     return range(count)
