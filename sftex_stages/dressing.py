@@ -32,12 +32,13 @@ def render(args: argparse.Namespace) -> int:
     if not args.output.parent.is_dir():
         raise StoreError(f"{args.output.parent}: no such folder; make it first")
     from . import images  # only now: the command line as a whole stays quick
+    from .guarded import apart
     from .results import dress, exports
     from .results.archive import open_result
 
     path = args.result / "result.h5" if args.result.is_dir() else args.result
     result = open_result(path)
-    picture = images.load_image(args.texture) if args.texture else None
+    picture = apart(images.load_image, args.texture) if args.texture else None
     on = dress.continued(result)
     turn, shift = args.turn or 0.0, args.shift or (0.0, 0.0)
     albedo = dress.printed(on, *picture, args.tile_px, turn, shift) if picture else on.albedo

@@ -1,9 +1,9 @@
-"""HDF5 files from others, read where a crash, a hang or a bomb does no harm: in a child process.
+"""Files from others, read where a crash, a hang or a bomb does no harm: in a child process.
 
-It opens the file without locks and may not write any file. It takes nothing but plain datasets of this one file: soft
-and external links, external storage and virtual datasets are refused, and so is, before any of it is read, more data
-than allowed or than the file's bytes can hold. A server that ends with its parent has the libraries loaded and forks a
-child for every file, so that no file meets what another one left behind.
+HDF5 is opened without locks by a child that may not write any file. It takes nothing but plain datasets of this one
+file: soft and external links, external storage and virtual datasets are refused, and so is, before any of it is read,
+more data than allowed or than the file's bytes can hold. A server that ends with its parent has the libraries loaded
+and forks a child for every file, so that no file meets what another one left behind.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import atexit
 import contextlib
 import importlib
 import json
+import multiprocessing
 import os
 import selectors
 import signal
@@ -19,8 +20,10 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -49,6 +52,7 @@ class DamagedFileError(Exception):
     """What is wrong with a file, in words (in the parent)."""
 
 
+_T = TypeVar("_T")
 Check = Callable[[Mapping[str, Any], Mapping[str, Declared]], None]
 
 
@@ -74,6 +78,17 @@ def survey_hdf5(path: Path, max_bytes: int = 8 << 30, what: str = "HDF5") -> dic
     with contextlib.suppress(_Enough):
         _guarded(path, what, None, max_bytes, note)
     return found
+
+
+def apart(function: Callable[..., _T], path: Path, *more: Any) -> _T:
+    """``function(path, *more)``, called in a process of its own. InputError if the file is the death of it."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(function, path, *more).result()
+        except BrokenProcessPool as error:
+            raise InputError(
+                f"{path}: the process that read it died; save the file anew with another program"
+            ) from error
 
 
 class _Enough(Exception):

@@ -207,6 +207,25 @@ def test_bombs(tmp_path, measured):
     measured("decompression bombs and absurd sizes", len(sizes), f"refused or harmless; {grown} MB more memory at most")
 
 
+def die(path):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_texture_that_crashes_its_decoder_is_an_error(tmp_path, monkeypatch, capfd):
+    result_files(tmp_path)
+    monkeypatch.setattr(images, "load_image", die)
+    arguments = [
+        "render",
+        str(tmp_path / "plain.h5"),
+        "--texture",
+        str(tmp_path / "x.png"),
+        "-o",
+        str(tmp_path / "o.png"),
+    ]
+    assert cli.main(arguments) == cli.USAGE and not (tmp_path / "o.png").exists()
+    assert "x.png: the process that read it died" in capfd.readouterr().err
+
+
 def reader():
     """The process that reads the present file: the only child of the server."""
     server = guarded._server.process.pid
