@@ -28,6 +28,13 @@ def surface_of(n=600, noise=0.0, seed=0):
     return arrays, scale
 
 
+def run(surface, image=None, **params):
+    """The stage, on a picture without any plain print unless one is given."""
+    if image is None:
+        image = np.random.default_rng(9).uniform(0.05, 1, (*SHAPE, 3)).astype(np.float32)
+    return irradiance.run({"surface": surface, "image": {"rgb": image}}, irradiance.Params(**params))
+
+
 def field(x, y):
     return np.exp(0.4 * np.sin(x / 60) - 0.5 * np.cos(y / 80))
 
@@ -40,7 +47,7 @@ def log_error(out):
 
 def test_exact_data_give_map_and_scales():
     surface, scale = surface_of()
-    out = irradiance.run({"surface": surface}, irradiance.Params())
+    out = run(surface)
     assert np.quantile(log_error(out), 0.99) < 0.01
     found = out["class_scale"] / out["class_scale"][0]
     assert np.isnan(found[2]) and np.allclose(found[[0, 1, 3]], scale[[0, 1, 3]], rtol=0.005)
@@ -50,7 +57,7 @@ def test_exact_data_give_map_and_scales():
 
 def test_instances_are_put_on_the_maps_scale():
     surface, _ = surface_of()
-    out = irradiance.run({"surface": surface}, irradiance.Params())
+    out = run(surface)
     at = np.rint(surface["instance/xy"]).astype(int)
     inside = (surface["piece"] > 0)[at[:, 1], at[:, 0]]
     ratio = out["instance/irradiance"][inside] / out["map"][at[inside, 1], at[inside, 0]]
@@ -62,7 +69,7 @@ def test_noise_is_smoothed_and_outliers_of_either_kind_ignored():
     surface["instance/irradiance"][::20] *= 3
     surface["instance/irradiance"][5::40] = 0  # no positive estimate: left out
     surface["instance/state"][::20] = [0, 0, 1]
-    out = irradiance.run({"surface": surface}, irradiance.Params())
+    out = run(surface)
     assert np.median(log_error(out)) < 0.01
 
 
@@ -70,7 +77,7 @@ def test_too_few_instances():
     surface, _ = surface_of(10)
     surface["instance/inlier"][2:] = 0.1
     with pytest.raises(StageError, match="only 2 instances"):
-        irradiance.run({"surface": surface}, irradiance.Params())
+        run(surface)
 
 
 def test_pieces_share_scales_and_no_light():
@@ -79,7 +86,7 @@ def test_pieces_share_scales_and_no_light():
     surface["instance/irradiance"][right] *= 3  # another light begins behind the gap
     surface["piece"][:, 155:166] = 0
     surface["piece"][:, 166:] *= 2
-    out = irradiance.run({"surface": surface}, irradiance.Params())
+    out = run(surface)
     step = np.where(np.arange(SHAPE[1]) < 160, 1.0, 3.0)
     rows, columns = np.nonzero(surface["piece"])
     log = np.log(out["map"][rows, columns] / (field(columns, rows) * step[columns]))
@@ -93,7 +100,7 @@ def test_sigma_tells_where_the_light_is_known():
     surface, _ = surface_of(900, noise=0.03, seed=3)
     alone = surface["instance/xy"][:, 0] > 220
     surface["instance/inlier"][alone & (np.arange(900) % 8 > 0)] = 0  # an eighth of them is believed there
-    out = irradiance.run({"surface": surface}, irradiance.Params())
+    out = run(surface)
     assert np.array_equal(np.isfinite(out["sigma"]), surface["piece"] > 0)
     left, right = out["sigma"][20:-20, 20:180], out["sigma"][20:-20, 240:-20]
     assert np.median(right) > 1.3 * np.median(left)
@@ -101,3 +108,25 @@ def test_sigma_tells_where_the_light_is_known():
     ratio = np.log(out["map"][y, x] / field(x, y))
     ratio = np.abs(ratio - np.median(ratio)) / out["sigma"][y, x]
     assert 0.3 < np.median(ratio) < 1.5 and (ratio > 4).mean() < 0.05
+
+
+def test_plain_print_adds_what_lies_between_instances_unless_they_disagree():
+    surface, _ = surface_of(250, noise=0.005, seed=4)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    fold = np.exp(-0.5 * np.exp(-(((x - 160) / 9) ** 2)))  # narrower than the instances are apart
+    at = np.rint(surface["instance/xy"]).astype(int)
+    surface["instance/irradiance"] *= fold[at[:, 1], at[:, 0]].astype(np.float32)
+    cloth = (field(x, y) * fold)[..., None] * np.array([0.1, 0.15, 0.3])
+    dots = (x % 40 - 20) ** 2 + (y % 40 - 20) ** 2 < 60
+    cloth[dots] *= [3, 1, 0.5]
+
+    def error(out):
+        log = np.log(out["map"] / (field(x, y) * fold))[surface["piece"] > 0]
+        return np.abs(log - np.median(log))
+
+    alone, both = run(surface, plain=False), run(surface, cloth.astype(np.float32))
+    assert error(both).mean() < 0.3 * error(alone).mean() and both["plain_share"][1] > 0.8
+    # A ground whose albedo varies by itself: instances, which see the light alone, do not confirm it.
+    stained = cloth * np.exp(0.3 * np.sin(x / 11) * np.cos(y / 13))[..., None]
+    wrong = run(surface, stained.astype(np.float32))
+    assert error(wrong).mean() < 1.5 * error(alone).mean() and wrong["plain_share"].max() < 0.6

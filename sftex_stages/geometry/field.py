@@ -26,7 +26,8 @@ OFFSET_SPREAD = 3.0  # standard deviation of the field's mean
 @dataclass(frozen=True)
 class Irradiance:
     """The field: `grid` and coefficients `a` of its logarithm; textons' `offset` (K,) = c_k; robust weights (N,); noise
-    factor; log evidence in nats; `factor` of the field's precision given the offsets."""
+    factor; log evidence in nats; `factor` of the field's precision given the offsets; `tuned`, logarithms of the prior's
+    strength and reach and of the noise factor."""
 
     grid: spline.Grid
     a: Float
@@ -35,6 +36,7 @@ class Irradiance:
     noise: float
     evidence: float
     factor: blocks.Factor
+    tuned: Float
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,16 @@ def _posterior(s: _System, y: Float, weight: Float, strength: float, reach: floa
     return _Posterior(a, offset, factor, 0.5 * (fit + logdet))
 
 
-def fit(xy: Float, log_l: Float, sigma: Float, texton: Int, trust: Float, spacing: float, detail: float) -> Irradiance:
+def fit(
+    xy: Float,
+    log_l: Float,
+    sigma: Float,
+    texton: Int,
+    trust: Float,
+    spacing: float,
+    detail: float,
+    tuned: Float | None = None,
+) -> Irradiance:
     """Field and texton offsets from log irradiances; smoothness and noise of greatest evidence, robust.
 
     Parameters
@@ -102,6 +113,8 @@ def fit(xy: Float, log_l: Float, sigma: Float, texton: Int, trust: Float, spacin
         every one of which has a member with positive `trust` (N,), 0…1.
     spacing, detail
         px of the cells in which instances are pooled to find the smoothness; the grid's spacing is `detail` of that.
+    tuned
+        smoothness and noise of another fit, to be used as they are.
     """
     margin = 2 * spacing
     grid = spline.cover(xy.min(0) - margin, xy.max(0) + margin, detail * spacing)
@@ -112,7 +125,7 @@ def fit(xy: Float, log_l: Float, sigma: Float, texton: Int, trust: Float, spacin
     y = log_l - centre[texton]  # near zero, so that the weak priors are neutral
     base = trust / sigma**2
     robust = np.ones(len(xy))
-    x = np.log([10.0, spacing, 1.0])  # strength, reach, noise factor
+    x = np.log([10.0, spacing, 1.0]) if tuned is None else tuned  # strength, reach, noise factor
     for k in range(3):
         weight = base * robust / float(np.exp(x[2]))
         post = _posterior(full, y, weight, *np.exp(x[:2]))
@@ -122,11 +135,11 @@ def fit(xy: Float, log_l: Float, sigma: Float, texton: Int, trust: Float, spacin
         )[:, 0, 0]
         r = (y - full.values(post.a) - post.offset[texton]) / np.maximum(1 - weight * spread, 0.05)
         robust = (FREEDOM + 1) / (FREEDOM + r**2 * base / trust.clip(1e-9) / (np.exp(x[2]) + base * spread))
-        if k < 2:
+        if k < 2 and tuned is None:
             x = _tune(grid, xy, y - post.offset[texton], base * robust, cells, x)
     post = _posterior(full, y, base * robust / float(np.exp(x[2])), *np.exp(x[:2]))
     return Irradiance(
-        grid, post.a, post.offset + centre, robust * trust, float(np.exp(x[2])), post.evidence, post.factor
+        grid, post.a, post.offset + centre, robust * trust, float(np.exp(x[2])), post.evidence, post.factor, x
     )
 
 
