@@ -38,8 +38,8 @@ _NAMES = {
     ),
     "result": (
         "surface/valid", "surface/normals", "surface/height", "surface/normal_sigma", "surface/piece",
-        "irradiance/map", "instances/xy", "instances/normal", "instances/normal_sigma", "instances/inlier",
-        "instances/irradiance", "instances/texton",
+        "irradiance/map", "irradiance/sigma", "image/rgb", "chart/uv", "instances/xy", "instances/normal",
+        "instances/normal_sigma", "instances/inlier", "instances/irradiance", "instances/texton",
     ),
 }  # fmt: skip
 
@@ -83,12 +83,11 @@ class _File:
             raise InputError(f"{self.path}: focal_px and principal_point are not numbers (1 and 2)") from e
 
 
-def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path | str | None = None) -> dict[str, Any]:
+def evaluate(result_path: Path | str, truth_path: Path | str) -> dict[str, Any]:
     """Every figure of accuracy of a result, as nested dicts of numbers, None where a figure does not exist.
 
-    result_path: a `result.h5` or its folder; truth_path: see the module. image_path: the photograph; with it the
-    irradiance baseline of a blurred image is reported too. Angles in degrees, shares 0…1. Raises InputError if a file
-    cannot be used or the two do not belong together. `measures` defines each figure.
+    result_path: a `result.h5` or its folder; truth_path: see the module. Angles in degrees, shares 0…1. Raises InputError if a
+    file cannot be used or the two do not belong together. `measures` defines each figure.
     """
     truth = _File(Path(truth_path), "truth")
     size = truth.array("surface/valid", (None, None)).shape
@@ -118,6 +117,9 @@ def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path |
     piece = result.array("surface/piece", size) if result.has("surface/piece") else np.zeros(size, np.int32)
     instances = _accepted_instances(result)
     camera = result.camera()
+    photograph = result.array("image/rgb", (*size, 3)) if result.has("image/rgb") else None
+    spread_of_light = result.array("irradiance/sigma", size).astype(float) if result.has("irradiance/sigma") else None
+    chart = _chart(result, surface, valid, true_camera)
 
     turned = true_camera is not None and camera is None
     if turned:
@@ -140,7 +142,8 @@ def evaluate(result_path: Path | str, truth_path: Path | str, image_path: Path |
         "height": measures.compare_heights(
             height[level], surface["height"][level], true_range, piece[level], both_signs=true_camera is None
         ),
-        "irradiance": _irradiance(estimate, light, known & valid, known, image_path),
+        "irradiance": _irradiance(estimate, spread_of_light, light, known & valid, known, photograph),
+        "chart": chart,
         "instances": _instances(instances, surface["normals"], known, light, elements),
         "baselines": _baselines(surface["normals"][known]),
     }
@@ -220,7 +223,12 @@ def _instances(
 
 
 def _irradiance(
-    estimate: np.ndarray, light: np.ndarray | None, inside: np.ndarray, known: np.ndarray, image_path: Path | str | None
+    estimate: np.ndarray,
+    sigma: np.ndarray | None,
+    light: np.ndarray | None,
+    inside: np.ndarray,
+    known: np.ndarray,
+    photograph: np.ndarray | None,
 ) -> dict[str, Any] | None:
     """Figures of the irradiance map and of its baselines over the same pixels; None where the truth has no light."""
     if light is None:
@@ -228,20 +236,32 @@ def _irradiance(
     with np.errstate(invalid="ignore"):
         lit = inside & (light > 0) & (estimate > 0) & np.isfinite(light) & np.isfinite(estimate)
     out = measures.compare_irradiance(estimate[lit], light[lit])
+    out["calibration"] = None
+    if sigma is not None and lit.any():
+        ratio = np.log(estimate[lit] / light[lit])
+        out["calibration"] = measures.calibration(np.abs(ratio - np.median(ratio)), sigma[lit], deciles=True)
     # Where there is no estimate at all, the baselines are still worth knowing.
     over = lit if lit.any() else known & (light > 0)
     out["constant"] = measures.compare_irradiance(np.ones(int(over.sum())), light[over])
     out["blurred"] = None
-    if image_path is not None:
-        from .images import load_image  # only here: everything else works without an image library
-
-        rgb, _ = load_image(Path(image_path))
-        if rgb.shape[:2] != light.shape:
-            raise InputError(f"{image_path} is {rgb.shape[1]} × {rgb.shape[0]} pixels, its truth is another size")
-        blurred = measures.blurred_brightness(rgb, known)
+    if photograph is not None:
+        blurred = measures.blurred_brightness(np.nan_to_num(photograph), known)
         seen = over & (blurred > 0)
         out["blurred"] = measures.compare_irradiance(blurred[seen], light[seen])
     return out
+
+
+def _chart(
+    result: _File, surface: dict[str, np.ndarray], valid: np.ndarray, camera: tuple[float, np.ndarray] | None
+) -> dict[str, Any] | None:
+    """How far the chart is from isometry on the true surface; None without a chart."""
+    if not result.has("chart/uv"):
+        return None
+    focal, centre = camera or (np.inf, np.zeros(2))
+    inside = valid & surface["valid"]
+    return measures.chart_distortion(
+        result.array("chart/uv", (*valid.shape, 2)), surface["normals"], surface["height"], inside, focal, centre
+    )
 
 
 def _baselines(normals: np.ndarray) -> dict[str, Any]:
@@ -314,6 +334,11 @@ def format_text(figures: dict[str, Any]) -> str:
         lines.append(f"  constant           {_light(light['constant'])}")
         if light["blurred"]:
             lines.append(f"  blurred image      {_light(light['blurred'])}")
+        if light["calibration"]:
+            lines.append(f"  |error| / sigma    {_calibration(light['calibration'])}")
+    if chart := figures["chart"]:
+        angles, areas = _number(chart["angle"]["median"], ".2f", "°"), _percent(chart["area"]["median"])
+        lines.append(f"chart                angles change by {angles}, areas by {areas} (medians on the true one)")
     return "\n".join(lines)
 
 

@@ -194,6 +194,43 @@ def blurred_brightness(rgb: np.ndarray, inside: np.ndarray) -> np.ndarray:
     return gaussian_filter(rgb.mean(axis=2) * inside, sigma) / np.maximum(weight, 1e-9)
 
 
+def chart_distortion(
+    chart: np.ndarray, normals: np.ndarray, height: np.ndarray, inside: np.ndarray, focal: float, centre: np.ndarray
+) -> dict[str, Any]:
+    """Distortion of a chart (H, W, 2) px of a known surface: `angle`, degrees by which it changes an angle at most at a point (Tissot), and `area`, |change of area| / area; `median` and `p95` of each over the surface.
+
+    normals (H, W, 3) in the camera's frame; `focal` inf: orthographic. Under perspective, where a surface has no absolute size,
+    the median change of area is removed.
+    """
+    slopes = np.stack(np.gradient(np.asarray(chart, float), axis=(1, 0)), -1)  # (H, W, 2, 2): d (u, v) / d (x, y)
+    y, x = np.indices(inside.shape, dtype=float)
+    good = inside & np.isfinite(slopes).all((2, 3)) & (normals[..., 2] > 0.02)
+    j, n, z = slopes[good], normals[good], height[good]
+    offset = (np.stack([x[good], y[good]], 1) - centre) / focal
+    depth = 1 - z / focal
+    dz = -depth[:, None] * n[:, :2] / (n[:, 2] - (n[:, :2] * offset).sum(1))[:, None]
+    cross = depth[:, None, None] * offset[:, :, None] * dz[:, None, :]
+    metric = (depth**2)[:, None, None] * np.eye(2) - cross - np.swapaxes(cross, 1, 2)
+    metric += (1 + (offset**2).sum(1))[:, None, None] * dz[:, :, None] * dz[:, None, :]  # lengths: dxᵀ metric dx
+    size = np.sqrt(np.linalg.det(metric)) if len(metric) else np.zeros(0)
+    total = np.trace(j @ np.linalg.inv(metric) @ np.swapaxes(j, 1, 2), axis1=1, axis2=2)  # σ1² + σ2²
+    area = np.linalg.det(j) / np.maximum(size, 1e-12)  # σ1 σ2
+    ratio = np.sqrt(np.maximum(total - 2 * area, 0) / np.maximum(total + 2 * area, 1e-12))
+    angle_ = np.degrees(2 * np.arcsin(np.clip(ratio, 0, 1)))
+    if np.isfinite(focal) and len(area):
+        area = area / np.median(area)
+    values = {"angle": angle_, "area": np.abs(area - 1)}
+    if not len(size):
+        return {name: {"median": None, "p95": None} for name in values}
+    out = {}
+    for name, value in values.items():
+        order = np.argsort(value)
+        share = np.cumsum(size[order]) / size.sum()
+        median, p95 = (float(value[order][min(int(np.searchsorted(share, q)), len(order) - 1)]) for q in (0.5, 0.95))
+        out[name] = {"median": median, "p95": p95}
+    return out
+
+
 def compare_instances(normal: np.ndarray, sigma: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     """Instance normals (N, 3) against the true ones (N, 3) at their places; `sigma` (N,) predicts the error, degrees.
 

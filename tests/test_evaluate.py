@@ -196,16 +196,16 @@ def test_perspective_truth_is_compared_relative_to_the_ray(tmp_path: Path) -> No
 
 
 def test_blurred_baseline_comes_from_the_photograph(tmp_path: Path, truth: Path) -> None:
-    cv2 = pytest.importorskip("cv2")
-    image = tmp_path / "ball.png"
-    encoded = np.clip(255 * sphere()["light"] ** (1 / 2.2), 0, 255).astype(np.uint8)
-    cv2.imwrite(str(image), np.dstack([encoded] * 3))
-    light = evaluate(write_result(tmp_path / "r.h5", sphere()), truth, image)["irradiance"]
+    photograph = np.dstack([sphere()["light"]] * 3)
+    light = evaluate(write_result(tmp_path / "r.h5", sphere(), image__rgb=photograph), truth)["irradiance"]
     assert light["blurred"]["error"] < 0.5 * light["constant"]["error"]  # a white ball's picture is its light
 
 
 def test_text_is_aligned_and_shows_the_figures(tmp_path: Path, truth: Path) -> None:
-    text = format_text(evaluate(write_result(tmp_path / "r.h5", sphere()), truth))
+    x, y = np.meshgrid(np.arange(W), np.arange(H))
+    more = {"chart__uv": np.dstack([x, y]).astype(float), "irradiance__sigma": np.full((H, W), 0.02)}
+    text = format_text(evaluate(write_result(tmp_path / "r.h5", sphere(), **more), truth))
+    assert "chart                angles change by" in text
     table = [line for line in text.splitlines() if "°" in line and ("surface," in line or "instances," in line)]
     assert len(table) == 6 and len({len(line) for line in table}) == 1
     assert "recall             100.0 % (11 of 11" in text and "None" not in text and "nan" not in text

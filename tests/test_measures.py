@@ -161,3 +161,36 @@ def test_value_at_walks_and_forgives() -> None:
     figures = {"a": {"b": {"c": 2.0}, "none": None}}
     assert measures.value_at(figures, "a.b.c") == 2.0
     assert measures.value_at(figures, "a.none.c") is None and measures.value_at(figures, "a.x") is None
+
+
+def test_a_chart_is_measured_on_the_true_surface() -> None:
+    y, x = np.mgrid[:60, :80].astype(float)
+    z = np.sqrt(100**2 - (x - 40) ** 2)
+    normals = np.dstack([(x - 40) / 100, np.zeros_like(x), z / 100])
+    inside = np.ones((60, 80), bool)
+    unrolled = np.dstack([100 * np.arcsin((x - 40) / 100), y])
+    for chart, degrees, area in (
+        (unrolled, 0.0, 0.0),
+        (unrolled * [2, 1], np.degrees(2 * np.arcsin(1 / 3)), 1.0),
+        (unrolled @ np.array([[0.6, 0.8], [-0.8, 0.6]]) * 1.1, 0.0, 0.21),
+    ):
+        got = measures.chart_distortion(chart, normals, z, inside, np.inf, np.zeros(2))
+        assert got["angle"]["median"] == pytest.approx(degrees, abs=0.1)
+        assert got["area"]["p95"] == pytest.approx(area, abs=0.01)
+    flat = measures.chart_distortion(np.dstack([x, y]), normals, z, inside, np.inf, np.zeros(2))
+    assert flat["area"]["p95"] == pytest.approx(1 - np.sqrt(1 - 0.38**2), abs=0.01)  # cos of the slant at |x − 40| = 38
+    nothing = measures.chart_distortion(unrolled, normals, z, ~inside, np.inf, np.zeros(2))
+    assert nothing["angle"]["median"] is None
+
+
+def test_a_chart_under_perspective_is_free_in_size_only() -> None:
+    focal, centre = 200.0, np.array([40.0, 30.0])
+    y, x = np.mgrid[:60, :80].astype(float)
+    normal = np.array([0.5, 0.2, 1.0]) / np.sqrt(1.29)
+    offset = np.dstack([x, y]) - centre
+    z = -(offset @ normal[:2]) / (normal[2] - offset @ normal[:2] / focal)  # the plane through (centre, 0)
+    points = np.dstack([offset * (1 - z / focal)[..., None], z])
+    u = np.cross([0, 1, 0], normal) / np.linalg.norm(np.cross([0, 1, 0], normal))
+    chart = np.dstack([points @ u, points @ np.cross(normal, u)]) * 3
+    got = measures.chart_distortion(chart, np.tile(normal, (60, 80, 1)), z, np.ones((60, 80), bool), focal, centre)
+    assert got["angle"]["p95"] < 0.2 and got["area"]["p95"] < 0.01

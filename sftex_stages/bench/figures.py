@@ -82,6 +82,13 @@ FIGURES = {
     "peak_memory": Figure("peak of all jobs", "MB"),
     "frontal_memory": Figure("frontal job's peak", "MB"),
     "irradiance_seconds": Figure("irradiance stage", "s"),
+    "light_ratio": Figure("light error/σ", "", None),
+    "chart_angle": Figure("chart, angles", "°"),
+    "chart_angle_95": Figure("angles, p95", "°"),
+    "chart_area": Figure("chart, areas", "%"),
+    "chart_area_95": Figure("areas, p95", "%"),
+    "retexture": Figure("own print put back", "%"),
+    "render_seconds": Figure("sftex render", "s"),
 }
 
 _EVALUATED = {
@@ -107,6 +114,11 @@ _EVALUATED = {
     "light_correlation": "irradiance.correlation",
     "light_constant": "irradiance.constant.error",
     "light_blurred": "irradiance.blurred.error",
+    "light_ratio": "irradiance.calibration.median_ratio",
+    "chart_angle": "chart.angle.median",
+    "chart_angle_95": "chart.angle.p95",
+    "chart_area": "chart.area.median",
+    "chart_area_95": "chart.area.p95",
     "frontal_baseline": "baselines.frontal.median",
     "constant_baseline": "baselines.constant.median",
 }
@@ -226,6 +238,10 @@ _ROWS: list[_Row] = [
     (_ALL, "frontal_ms", 1, None),
     (_ALL, "frontal_memory", 300, None),
     (_ALL, "irradiance_seconds", 3, None),
+    (_ALL, "render_seconds", 5, None),
+    (("cylinder_flowers_sun", "wave_paisley_side"), "chart_angle", 3, None),
+    (("cylinder_flowers_sun", "wave_paisley_side"), "chart_area", 0.05, None),
+    (("cylinder_flowers_sun",), "retexture", 0.05, None),
 ]
 _RATIO = (0.5, 1.5)  # wanted range of the median instance error in units of sigma
 VARIANTS = ("_noise_q70", "_noise")  # endings of degraded copies of a scene, which share its truth

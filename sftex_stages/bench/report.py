@@ -19,9 +19,10 @@ _TABLES = {
                 "dense_p90", "dense_5", "dense_11", "dense_22", "dense_30", "dense_all_11", "coverage", "height",
                 "height_scaled", "pixel_ratio", "pixel_beyond_3", "pixel_factor", "frontal_baseline",
                 "constant_baseline"],
-    "Irradiance": ["light", "light_correlation", "light_gain", "light_blurred", "light_constant"],
+    "Irradiance": ["light", "light_correlation", "light_gain", "light_blurred", "light_constant", "light_ratio"],
+    "Chart and new prints": ["chart_angle", "chart_angle_95", "chart_area", "chart_area_95", "retexture"],
     "Cost": ["seconds", "cached_seconds", "keypoints", "frontal_ms", "frontal_memory", "peak_memory",
-             "irradiance_seconds"],
+             "irradiance_seconds", "render_seconds"],
 }  # fmt: skip
 _NOISE = {"s": 0.25, "ms": 0.25, "MB": 0.1}  # relative change of a cost that means nothing
 _STILL = 0.02  # relative change of any other figure that is not worth a line

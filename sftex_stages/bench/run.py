@@ -19,6 +19,8 @@ import h5py
 from ..errors import InputError, SftexError
 from ..evaluate import evaluate
 from ..images import discover
+from ..results.archive import open_result
+from . import dressing
 from .figures import headline, original
 
 _SFTEX = [sys.executable, "-c", "import sys; from sftex_stages.cli import main; sys.exit(main())"]
@@ -79,7 +81,10 @@ def measure(case: Case, work: Path, config: Path | None, jobs: int | None, limit
         result = _only_result(out)
         spent = costs(result, out / ".store") | {"seconds": seconds, "cached_seconds": cached}
         entry["stages"] = spent.pop("stages")
-        entry["figures"] = evaluate(result, case.truth, case.image) if case.truth else None
+        entry["figures"] = evaluate(result, case.truth) if case.truth else None
+        spent["render_seconds"] = dressing.render_seconds(_SFTEX, result, work)
+        if case.truth:
+            spent["retexture"] = dressing.round_trip(open_result(result), case.truth)
         entry["numbers"] = headline(entry["figures"], spent)
     except SftexError as error:
         entry["failed"] = str(error)
