@@ -197,8 +197,9 @@ def blurred_brightness(rgb: np.ndarray, inside: np.ndarray) -> np.ndarray:
 def chart_distortion(
     chart: np.ndarray, normals: np.ndarray, height: np.ndarray, inside: np.ndarray, focal: float, centre: np.ndarray
 ) -> dict[str, Any]:
-    """Distortion of a chart (H, W, 2) px of a known surface: `angle`, degrees by which it changes an angle at most at a point (Tissot), and `area`, |change of area| / area; `median` and `p95` of each over the surface.
+    """Distortion of a chart (H, W, 2) px of a known surface; `median` and `p95` of each figure over its area.
 
+    `angle`: degrees by which the chart changes an angle at most at a point (Tissot); `area`: |change of area| / area.
     normals (H, W, 3) in the camera's frame; `focal` inf: orthographic. Under perspective, where a surface has no absolute size,
     the median change of area is removed.
     """
