@@ -4,8 +4,9 @@ import pytest
 import toy_pipeline as toy
 from faults import LONG, check, results
 
-from sftex_stages.engine import runs, upkeep, worker
+from sftex_stages.engine import bundle, runs, upkeep, worker
 from sftex_stages.engine.store import Store
+from sftex_stages.errors import InputError
 
 KINDS = {
     "artefact": ".store/*/??/*.h5", "receipt": ".store/*/??/*.json", "ledger": ".store/items/*.json",
@@ -55,3 +56,28 @@ def test_damage_is_found_and_mended(folder, serial, rng, measured, kind):
             cases += 1
     words = "100 % found by verify and by the next run; computed again with the same bytes"
     measured(f"a flipped bit in each region, every cut: {kind}", cases, words)
+
+
+def test_damaged_archives_are_refused_or_restored_whole(folder, serial, rng, measured):
+    """Headers of a tar have a checksum, its members a SHA-256; what is left between them says nothing."""
+    found, planner = toy.run(folder / "out", folder / "a.txt", folder / "b.txt")
+    name = runs.record(planner.store.root, "", [result.plan for result in found.values()])
+    source, damaged = folder / "run.tar", folder / "bad.tar"
+    bundle.archive(planner.store, folder / "out", runs.find(planner.store.root, name), source)
+    expected = results(folder / "out")
+    cases = refused = 0
+    for content in damages(source.read_bytes(), rng, 400 if LONG else 8):
+        damaged.write_bytes(content)
+        out = folder / f"restored{cases}"
+        try:
+            bundle.restore(Store(out / ".store"), out, damaged)
+        except InputError as error:
+            assert "bad.tar" in str(error)
+            assert not results(out) and not list((out / ".store" / "tmp").iterdir())
+            refused += 1
+        else:
+            assert results(out) == expected
+        cases += 1
+    assert refused >= 5
+    words = f"{refused} refused without a trace, {cases - refused} restored whole (padding)"
+    measured("a flipped bit in each region, every cut: archive", cases, words)
