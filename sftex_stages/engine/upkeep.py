@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from ..errors import StoreError
@@ -32,9 +33,8 @@ def verify(store: Store, out: Path) -> Health:
     """Hash every artefact, receipt, ledger, record and delivered file again. StoreError if the store cannot be read."""
     health = Health()
     places = list(store.receipts())
-    # one store per job of the pool: nothing verified is remembered, so nothing is taken on trust
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for size, notices in pool.map(lambda place: _verify(store.root, *place), places):
+        for size, notices in pool.map(partial(_verify, store.root), _batches(places)):
             health.bytes += size
             health.damaged += notices
     health.checked = len(places)
@@ -43,20 +43,19 @@ def verify(store: Store, out: Path) -> Health:
         for path in store.root.glob("*/??/*.h5")
         if path.parts[-3] not in RESERVED
     )
+    delivered: list[tuple[Path, str]] = []
     for path, label, steps in ledger.read_all(store.root):
         if not label:
             health.damaged.append(_set_aside(store.root, path))
             continue
         for stage in steps.values():
-            for name, sha256 in stage["jobs"][0][1].get("files", {}).items() if stage["jobs"] else ():
-                health.results += 1
-                delivered = out / label / name
-                if not delivered.is_file():
-                    health.changed.append(f"{delivered} is missing")
-                elif keys.file_sha256(delivered) != sha256:
-                    health.changed.append(f"{delivered} was changed")
-                else:
-                    health.bytes += delivered.stat().st_size
+            files = stage["jobs"][0][1].get("files", {}) if stage["jobs"] else {}
+            delivered += [(out / label / name, sha256) for name, sha256 in files.items()]
+    health.results = len(delivered)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for size, problem in pool.map(_compare, delivered):
+            health.bytes += size
+            health.changed += problem
     for path in sorted((store.root / "runs").glob("*.json")):
         try:
             ledger.unseal(path.read_bytes())
@@ -65,12 +64,30 @@ def verify(store: Store, out: Path) -> Health:
     return health
 
 
-def _verify(root: Path, stage: str, key: str) -> tuple[int, list[str]]:
-    store = Store(root)
-    receipt, problem = store.find(stage, key)
-    if receipt is None and not store.notices and problem:
-        store.notices.append(f"{stage} {key[:12]}: {problem}; computed again when it is next needed")
-    return (receipt["artefact"] or {"bytes": 0})["bytes"] if receipt else 0, store.notices
+def _batches(places: list[Place]) -> list[list[Place]]:
+    return [places[start : start + 256] for start in range(0, len(places), 256)]
+
+
+def _verify(root: Path, places: list[Place]) -> tuple[int, list[str]]:
+    """Bytes of the intact artefacts among some jobs, and what is wrong with the others."""
+    store, size = Store(root), 0  # a new one: it has verified nothing yet
+    for stage, key in places:
+        before = len(store.notices)
+        receipt, problem = store.find(stage, key)
+        if receipt is None and len(store.notices) == before and problem:
+            store.notices.append(f"{stage} {key[:12]}: {problem}; computed again when it is next needed")
+        size += receipt["artefact"]["bytes"] if receipt and receipt["artefact"] else 0
+    return size, store.notices
+
+
+def _compare(delivered: tuple[Path, str]) -> tuple[int, list[str]]:
+    """Bytes of a delivered file, or what is wrong with it."""
+    path, sha256 = delivered
+    if not path.is_file():
+        return 0, [f"{path} is missing"]
+    if keys.file_sha256(path) != sha256:
+        return 0, [f"{path} was changed"]
+    return path.stat().st_size, []
 
 
 def _set_aside(root: Path, path: Path) -> str:
