@@ -186,8 +186,8 @@ def _spacing(xy: Float, params: Params) -> float:
 
 def _label_at(piece: Int, xy: Float) -> Int:
     """Label (N,) of the piece nearest to each of `xy` (N, 2), 0 without any."""
-    if not piece.any():
-        return np.zeros(len(xy), np.int64)
+    if piece.max() <= 1:
+        return np.full(len(xy), piece.max(), np.int64)
     row, column = distance_transform_edt(piece == 0, return_distances=False, return_indices=True)
     x, y = (np.clip(np.rint(xy[:, k]).astype(int), 0, piece.shape[1 - k] - 1) for k in (0, 1))
     return np.asarray(piece[row[y, x], column[y, x]])
