@@ -62,7 +62,7 @@ def _seen(on: Cloth, picture: np.ndarray, view: tuple[float, float]) -> np.ndarr
     """The cloth, dressed in the picture (H, W, 3) uint8, from azimuth and elevation in degrees."""
     from .results.render import render as oblique
 
-    return oblique(on.height, on.normals, on.there, (picture,), *view, size=max(picture.shape[:2]))[0]
+    return oblique(on.height, on.normals, on.there, (picture,), *view, size=max(picture.shape[:2]), camera=on.camera)[0]
 
 
 def _write(path: Path, content: bytes) -> None:

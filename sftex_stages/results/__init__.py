@@ -21,7 +21,7 @@ from .mesh import bake
 from .mesh import mesh as make_mesh
 
 #: Raise it whenever a file's content or the list of files changes: with it the files are written anew.
-VERSION = 6
+VERSION = 7
 
 #: The files of one photograph's folder, in the order in which they are written.
 FILES = {
@@ -79,12 +79,12 @@ def _contents(arrays: Mapping[str, Any], meta: Mapping[str, Any], scratch: Path)
     """Name and bytes of each file, made one after another so that one file at a time is in memory."""
     surface, frontal, light = arrays["surface"], arrays["frontal"], arrays["irradiance"]
     height, normals, valid = surface["height"], surface["normals"], surface["valid"]
-    photo = to_display(arrays["image"]["rgb"])
+    photo, camera = to_display(arrays["image"]["rgb"]), Pinhole.of(surface)
     counts = np.bincount(surface["instance/texton"], minlength=len(frontal))
     about = f"sftex result of {meta['image_name']} (SHA-256 {meta['image_sha256']}); {archive.AXES}"
 
     yield "result.h5", archive.encode(arrays, meta)
-    textured, grey = render.render(height, normals, valid, (photo, None))
+    textured, grey = render.render(height, normals, valid, (photo, None), camera=camera)
     yield "surface_textured.png", _png(textured)
     yield "surface_grey.png", _png(grey)
     yield "normals.png", _png(pictures.normal_map(normals, valid))
@@ -102,7 +102,7 @@ def _contents(arrays: Mapping[str, Any], meta: Mapping[str, Any], scratch: Path)
     yield "irradiance.exr", exports.exr(both, ("Y", "sigma"), f"relative linear irradiance; {about}", scratch)
     layers = np.dstack([np.where(seen[..., None], bare, 0), seen])
     yield "albedo.exr", exports.exr(layers, ("R", "G", "B", "A"), f"linear albedo on the image's scale; {about}", scratch)
-    mesh = make_mesh(height, normals, surface["piece"], arrays["chart"]["uv"], Pinhole.of(surface))
+    mesh = make_mesh(height, normals, surface["piece"], arrays["chart"]["uv"], camera)
     texture = exports.encode(to_display(bake(mesh, bare), exposure), ".jpg")
     yield "surface.jpg", texture
     yield "surface.ply", exports.ply(mesh, shown, "surface.jpg")

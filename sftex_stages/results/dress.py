@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ..errors import InputError
 from ..geometry import fill
+from ..geometry.chart import Pinhole
 from . import cloth, light, retexture
 from .archive import Result
 
@@ -22,7 +23,7 @@ SMALL = 1e4  # what a logarithm of irradiance or a height, in px, may be at most
 @dataclass(frozen=True)
 class Cloth:
     """The surface continued to the cloth's border, (H, W, …): `image` linear; `there` bool; `chart` px, `irradiance`, `normals`
-    and `height` NaN off it; `white`, the brightness of white print."""
+    and `height` NaN off it; `white`, the brightness of white print; `camera`."""
 
     image: np.ndarray
     there: np.ndarray
@@ -31,6 +32,7 @@ class Cloth:
     normals: np.ndarray
     height: np.ndarray
     white: float
+    camera: Pinhole
 
     @property
     def albedo(self) -> np.ndarray:
@@ -68,7 +70,13 @@ def continued(result: Result) -> Cloth:
     normals = np.dstack([lean, np.sqrt(1 - (lean**2).sum(2))])
     chart = np.dstack([whole[..., 0] + x, whole[..., 1] + y])
     bare = light.albedo(image, result.irradiance, known)
-    return Cloth(image, there, chart, np.exp(whole[..., 2]), normals, whole[..., 5], light.white(bare))
+    return Cloth(image, there, chart, np.exp(whole[..., 2]), normals, whole[..., 5], light.white(bare), _camera(result))
+
+
+def _camera(result: Result) -> Pinhole:
+    if result.focal_px is None or result.principal_point is None or not 1 < result.focal_px < SMALL**2:
+        return Pinhole()
+    return Pinhole(result.focal_px, result.principal_point)
 
 
 def printed(

@@ -14,12 +14,15 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
+from ..geometry.chart import Pinhole
 from .exports import to_display
 from .mesh import STEEPEST
 
 BACKGROUND = (244, 244, 246)
 SUPERSAMPLING = 2
+ORTHOGRAPHIC = Pinhole()
 
 
 class _View(NamedTuple):
@@ -38,18 +41,22 @@ def render(
     azimuth: float = -35.0,
     elevation: float = 20.0,
     size: int = 840,
+    camera: Pinhole = ORTHOGRAPHIC,
 ) -> list[np.ndarray]:
     """Pictures of a height field from one direction, each (h, w, 3) uint8 RGB, the longer side `size` pixels.
 
     height (H, W) px, normals (H, W, 3) and valid (H, W) in the image's frame (x right, y down, z toward the camera).
     One picture for each of `textures`: (H, W, 3) uint8 sRGB, or None: grey in a light from the upper left. The camera
     moves to the right by `azimuth` and up by `elevation` degrees (|angles| < 80) from the photograph's own view. Where
-    the back of the surface shows, it is lit like its front, but darker.
+    the back of the surface shows, it is lit like its front, but darker. A surface seen by a perspective `camera` is first drawn
+    as it would look from afar.
     """
     view = _camera(azimuth, elevation)
     valid = valid & np.isfinite(height) & np.isfinite(normals).all(axis=2)
     if not valid.any():
         raise ValueError("nothing to render: no pixel is valid")
+    if np.isfinite(camera.focal):
+        height, normals, valid, textures = _from_afar(height, normals, valid, textures, camera)
     y, x = np.nonzero(valid)
     points = np.stack([x, y, height[valid]]).astype(np.float64)
     low, high = (np.array([f(view.right @ points), f(view.down @ points)]) for f in (np.min, np.max))
@@ -80,6 +87,37 @@ def render(
         layers[~seen] = 0
         pictures.append(_develop(layers, cross, along, np.array([a[0], top * pitch]), low, high, pitch))
     return pictures
+
+
+def _from_afar(
+    height: np.ndarray,
+    normals: np.ndarray,
+    valid: np.ndarray,
+    textures: Sequence[np.ndarray | None],
+    camera: Pinhole,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray | None]]:
+    """The maps of a perspective photograph as an orthographic one of the same surface, on a grid of px of the distance f."""
+    row, column = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    whole = height[row, column].astype(np.float32)
+    y, x = np.nonzero(valid)
+    points = camera.points(np.stack([x, y], 1), height[valid].astype(float))
+    low, high = np.floor(points[:, :2].min(0)), np.ceil(points[:, :2].max(0))
+    step = max(1.0, float((high - low).max() / (2 * max(valid.shape))))  # a hostile height must not ask for a huge picture
+    there = np.stack(np.meshgrid(*(np.arange(low[k], high[k] + step, step) for k in (0, 1))), -1) - camera.centre
+    at = there.copy()
+    for _ in range(20):  # the point whose ray passes here lies at x = c + (X − c) / (1 − z(x) / f)
+        place = (at + camera.centre).astype(np.float32)
+        z = cv2.remap(whole, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        at = there / np.maximum(1 - z / camera.focal, 0.05)[..., None]
+    place = (at + camera.centre).astype(np.float32)
+
+    def moved(values: np.ndarray) -> np.ndarray:
+        return cv2.remap(values, place[..., 0], place[..., 1], cv2.INTER_LINEAR)
+
+    seen = moved(valid.astype(np.float32)) > 0.5
+    turned = moved(np.ascontiguousarray(normals[row, column], np.float32))
+    turned /= np.maximum(np.linalg.norm(turned, axis=2, keepdims=True), 1e-6)
+    return moved(whole) / step, turned, seen, [None if t is None else moved(t) for t in textures]
 
 
 def _form(f: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

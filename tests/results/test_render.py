@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sftex_stages.geometry.chart import Pinhole
 from sftex_stages.results.render import BACKGROUND, render
 
 
@@ -126,3 +127,21 @@ def test_angles_and_emptiness_are_checked() -> None:
     height, normals, valid = plane(5, 5)
     with pytest.raises(ValueError, match="no pixel is valid"):
         render(height, normals, valid & False)
+
+
+def test_a_perspective_surface_is_drawn_as_from_afar() -> None:
+    """A plane leaning away, ruled in squares in space: seen by a pinhole camera they converge, seen from afar they do not."""
+    camera = Pinhole(200.0, (60.0, 40.0))
+    normal = np.array([0.0, 0.5, 1.0]) / np.sqrt(1.25)
+    y, x = np.mgrid[:81, :121].astype(float)
+    xy = np.dstack([x, y])
+    z = camera.on_plane(xy, np.array([60.0, 40.0, 0.0]), normal)
+    places = camera.points(xy, z)
+    stripes = np.repeat((((places[..., 0] - 60) // 20 % 2) * 255).astype(np.uint8)[..., None], 3, 2)
+    normals = np.tile(normal.astype("f4"), (81, 121, 1))
+    (found,) = render(z.astype("f4"), normals, np.ones((81, 121), bool), (stripes,), 0.0, 0.0, 400, camera)
+    inner = found[:, :, 0].astype(float)
+    rows = (90, 125, 160)
+    edges = [np.flatnonzero(np.diff(inner[r, 100:300] > 122)) for r in rows]
+    for other in edges[1:]:
+        assert len(other) == len(edges[0]) > 2 and np.abs(other - edges[0]).max() <= 3  # upright, all the way down
