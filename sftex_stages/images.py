@@ -30,6 +30,8 @@ _MOST_CHANNELS = 64
 
 ColorSpace = Literal["auto", "srgb", "linear"]
 
+_FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm
+
 #: Endings that OpenImageIO knows but that are no photographs.
 _NOT_PHOTOGRAPHS = {"null", "nul", "term", "z", "zfile", "env", "sm", "vsm"}
 #: Photographs that cannot be decoded here. Raw files are TIFF in disguise: only their thumbnail would be read.
@@ -97,10 +99,33 @@ def load_mask(path: Path, max_megapixels: float = 50.0) -> np.ndarray:
     return grey > 0.5 * grey.max()
 
 
+def focal_length(path: Path) -> float | None:
+    """Focal length in px of the image as it is, from its EXIF data; None if these do not tell.
+
+    From the 35 mm equivalent, which is by the diagonal (CIPA DCG-001), or from the length in mm and the sensor's pixel
+    pitch. A photograph that was cropped without correcting these data has a longer one.
+    """
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        return None
+    spec = source.spec()
+    source.close()
+    equivalent = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm")
+    if equivalent > 0:
+        return equivalent * float(np.hypot(spec.width, spec.height)) / _FULL_FRAME_DIAGONAL
+    length, pitch = (spec.get_float_attribute(f"Exif:{n}") for n in ("FocalLength", "FocalPlaneXResolution"))
+    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(spec.get_int_attribute("Exif:FocalPlaneResolutionUnit", 2))  # mm
+    if not (length > 0 and pitch > 0 and unit):
+        return None
+    taken = spec.get_int_attribute("Exif:PixelXDimension", 0)
+    return length * pitch / unit * (spec.width / taken if taken > 0 else 1.0)
+
+
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """The `image` stage. inputs: "image" Path, "mask" Path or None.
 
-    Returns rgb (H, W, 3) float32 linear light and mask (H, W) bool (True = a surface may be here). Raises InputError.
+    Returns rgb (H, W, 3) float32 linear light, mask (H, W) bool (True = a surface may be here), and where the file tells it
+    focal_px (), its focal length in px. Raises InputError.
     """
     path, mask_path = inputs["image"], inputs["mask"]
     rgb, mask = load_image(path, params.max_megapixels, params.color_space)
@@ -113,10 +138,11 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
         mask &= given
     if not mask.any():
         raise InputError(f"{path}: no pixel is left (transparent, not finite, or outside of the mask)")
-    return {"rgb": rgb, "mask": mask}
+    focal = focal_length(path)
+    return {"rgb": rgb, "mask": mask} | ({} if focal is None else {"focal_px": np.array(focal)})
 
 
-STAGE = Stage(name="image", version=1, params=Params, run=run, files=("image", "mask"))
+STAGE = Stage(name="image", version=2, params=Params, run=run, files=("image", "mask"))
 
 
 def _read(path: Path, max_megapixels: float) -> tuple[np.ndarray, oiio.ImageSpec]:

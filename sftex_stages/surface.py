@@ -1,8 +1,8 @@
 """Surface stage: from instances with two-fold ambiguous normals to one smooth surface (section 4 of the paper)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,26 +16,42 @@ from sftex_stages.geometry import (
     calibration,
     confidence,
     gaussian,
+    mirror,
     perspective,
     pooling,
     refine,
     shading,
+    sign_regions,
     sign_search,
     spline,
     support,
     tensors,
+    verdict,
 )
 from sftex_stages.geometry import field as irradiance_field
 
 Float = NDArray[np.floating]
-
-LIGHT_ABOVE, BULGE = 3.0, 0.5  # nats of what is usual, when nothing measured tells
 
 
 class Pinhole(StageParams):
     """A known pinhole camera; its axis meets the centre of the image."""
 
     focal_px: float = Field(gt=0, description="Focal length, in pixels of this image")
+
+
+Point = tuple[float, float]
+Disc = tuple[float, float, Annotated[float, Field(gt=0)]]
+
+
+class HintParams(StageParams):
+    """What is known of a surface beforehand; it decides between a surface and its mirror image, piece by piece."""
+
+    near: tuple[Point, ...] = Field((), description="Points [x, y] px that stand out toward the camera")
+    far: tuple[Point, ...] = Field((), description="Points [x, y] px that lie back")
+    convex: tuple[Disc, ...] = Field((), description="Discs [x, y, radius] px that bulge toward the camera")
+    light: float | None = Field(
+        None, ge=-360, le=360, description="Where the light comes from, degrees: 0 right, 90 above, 180 left, 270 below"
+    )
 
 
 class Params(StageParams):
@@ -46,7 +62,15 @@ class Params(StageParams):
     )
     camera: Literal["auto", "orthographic"] | Pinhole = Field(
         "auto",
-        description="`auto` believes in perspective where element sizes prove it; `{focal_px: 2200}` if it is known",
+        description="`auto` takes the focal length from the photograph's EXIF data, or else believes in perspective where "
+        "element sizes prove it; `{focal_px: 2200}` if it is known",
+    )
+    start: Literal["auto", "cylinder", "sphere", "plane"] = Field(
+        "auto", description="Shape that the sign search starts from; `auto` starts from all of them and from light and spectra"
+    )
+    hints: HintParams = Field(
+        default_factory=HintParams.model_construct,
+        description="What is known beforehand: near, far: [[x, y], …]; convex: [[x, y, radius], …]; light: degrees",
     )
     min_inlier: float = Field(
         0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)"
@@ -126,16 +150,23 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     calibrated, its sign resolved; normal_sigma, what it is off the surface and the surface off the truth; texton; state,
     posteriors of {as delivered, the other sign, not from the surface}; sign_margin, nats by which the best rival pattern
     is worse that differs there (NaN: not used).
-    camera "orthographic" or "perspective", with focal_px (inf if orthographic) and principal_point (x, y); vote/…, nats by
-    which scale, light and bulge prefer this surface to its mirror image (`sign_votes`).
+    camera "orthographic" or "perspective", with focal_px (inf if orthographic) and principal_point (x, y).
+    Of the pieces, (P,) each: vote/…, nats by which cues prefer the sign taken to the other (`mirror.py`): scale, light,
+    bulge, hint, smoothness (the other pieces), and shading, by which a piece is tied to the light; mirror_margin, nats by
+    which the sign taken beats the other; region_margin, nats by which the best rival pattern is worse that turns
+    a tenth of the piece or more (inf: there is none).
+    texton/… (K, …) of the textons used: part, their number; shear, (e1, e2) of the correction I + ((e1, e2), (e2, −e1)) of the
+    frontal frame; slant_bias, degrees, the median of how much steeper it was delivered than the surface is; noise, factor on
+    its variance; reason, in words, if it disagrees with the others, else "".
     energy, −log evidence of the surface; candidate/… and light: see `record`.
 
     Raises
     ------
     StageError
-        without a usable texton, or with fewer than three instances to believe in.
+        without a usable texton, with fewer than three instances to believe in, or with a hint outside of the image.
     """
     mask = np.asarray(inputs["image"]["mask"], bool)
+    hints = read_hints(params.hints, mask.shape)
     rows = collect(inputs["frontal"], params.min_inlier)
     instances = prepare(rows, params)
     used = instances.trust > 0
@@ -147,27 +178,62 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
     data = search_data(instances, nodes, spacing, params)
     find = sign_search.search if params.method == "collapsed" else sign_search.by_em
-    candidates = find(data, coarse, spacing, params.finalists)
+    candidates = find(data, coarse, spacing, params.finalists, params.start)
     best = candidates[0]
     start = gaussian.gradients(coarse, best.a)
-    margin = np.append(sign_search.settle(data, coarse, best, 1)[1], np.nan)[nodes.member]
-    choice = choose_camera(instances, nodes, coarse.grid, start, best.smooth, spacing, mask.shape, params)
-    camera, height = choice.camera, None
+    coupled = sign_search.own_coupling(data, coarse, best)
+    regions, rise = sign_search.rivals(data, coupled, best.s)
+    margin = np.append(sign_regions.margins(regions, rise, len(best.s)), np.nan)[nodes.member]
+    sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
+    choice = choose_camera(nodes, coarse.grid, start, best.smooth, sizes, inputs["image"], params)
+    found = verdict.decide(nodes, coarse, coupled, data, best, start, sizes, choice, hints, spacing)
+    camera, height, before = choice.camera, None, nodes.xy
+    start = found.sign[found.piece, None] * start
     if camera.bend:
-        before = cKDTree(nodes.xy)
         instances = prepare(rows, params, camera)
         nodes = pool(instances, spacing, params)
         sizes = element_sizes(instances, nodes, spacing)
         change = np.log(camera.rays(nodes.xy)[1])
         height = sizes.heights(camera, nodes.xy, nodes.w, change) if sizes else None
-        start = start[before.query(nodes.xy)[1]]
-    votes = sign_votes(nodes.xy, start, best, choice)
-    sign = 1.0 if sum(votes.values()) >= 0 else -1.0
+        start = start[cKDTree(before).query(nodes.xy)[1]]
     fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy, camera.stretch(nodes.xy))
-    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, sign * start, best.smooth, height=height)
+    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, height=height)
+    instances, nodes, fine, solution = recalibrate(
+        instances, nodes, fine, solution, camera, spacing, params, height
+    )
     results = outputs(mask, instances, nodes, solution, fine, spacing, camera)
     results["instance/sign_margin"] = margin.astype(np.float32)
-    return results | record(candidates, sign < 0) | {f"vote/{k}": np.array(sign * v) for k, v in votes.items()}
+    results |= verdict.by_piece(results["piece"], before, found, regions, rise)
+    return results | record(candidates, found.mirrored)
+
+
+def recalibrate(
+    instances: Instances,
+    nodes: pooling.Nodes,
+    field: gaussian.Field,
+    solution: refine.Solution,
+    camera: perspective.Camera,
+    spacing: float,
+    params: Params,
+    height: gaussian.Heights | None,
+) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
+    """Textons corrected by the surface, and the surface refined from them: one round of the alternation."""
+    index, stencil = camera.stencil(field.grid, instances.xy)
+    seen, _ = tensors.predict(np.einsum("npk,nk->np", stencil, solution.a[index]))
+    transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
+    found = calibration.against_surface(
+        instances.calibration, transform, instances.covariance, instances.texton, instances.trust, seen
+    )
+    if np.array_equal(found.e, instances.calibration.e):
+        return instances, nodes, field, solution
+    instances = replace(instances, calibration=found)
+    nodes = pool(instances, spacing, params)
+    field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
+    start, smooth = gaussian.gradients(field, solution.a), solution.smooth
+    solution = refine.refine(
+        field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 2, height=height, noise=solution.noise
+    )
+    return instances, nodes, field, solution
 
 
 def pool(instances: Instances, spacing: float, params: Params) -> pooling.Nodes:
@@ -179,23 +245,47 @@ def pool(instances: Instances, spacing: float, params: Params) -> pooling.Nodes:
 
 
 def choose_camera(
-    instances: Instances,
     nodes: pooling.Nodes,
     grid: spline.Grid,
     start: Float,
     smooth: gaussian.Smoothness,
-    spacing: float,
-    shape: tuple[int, int],
+    sizes: perspective.Sizes | None,
+    image: Arrays,
     params: Params,
 ) -> perspective.Choice:
-    """The camera that is asked for, or told by element sizes, and what these say about the sign of `start` (M, 2)."""
+    """The camera that is asked for, or the photograph's own, or told by element `sizes`; and what these say about the sign of
+    `start` (M, 2)."""
+    shape = image["mask"].shape
     centre = ((shape[1] - 1) / 2, (shape[0] - 1) / 2)
     bend = 1 / params.camera.focal_px if isinstance(params.camera, Pinhole) else None
-    sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
-    if sizes is None:
+    if params.camera == "auto" and "focal_px" in image:
+        bend = 1 / float(image["focal_px"])
+    if params.camera == "orthographic" or sizes is None:
         return perspective.Choice(perspective.Camera(centre, bend or 0.0), 0.0, 0.0)
     size = float(max(shape))
     return perspective.choose(grid, nodes.xy, nodes.w, nodes.covariance, sizes, start, smooth, centre, size, bend)
+
+
+def read_hints(params: HintParams, shape: tuple[int, int]) -> mirror.Hints:
+    """The hints as arrays.
+
+    Raises
+    ------
+    StageError
+        if a point lies outside of an image of `shape` (H, W).
+    """
+    lists = {"near": params.near, "far": params.far, "convex": params.convex}
+    for name, rows in lists.items():
+        for row in rows:
+            if not (-0.5 <= row[0] <= shape[1] - 0.5 and -0.5 <= row[1] <= shape[0] - 0.5):
+                raise StageError(
+                    f"surface.hints.{name}: the point [{row[0]:g}, {row[1]:g}] lies outside of the image, which is "
+                    f"{shape[1]} x {shape[0]} pixels; give x from the left and y from the top, in pixels"
+                )
+    turn = None if params.light is None else np.radians(params.light)
+    light = None if turn is None else np.array([np.cos(turn), -np.sin(turn)])
+    near, far, convex = (np.array(v, float).reshape(-1, k) for v, k in zip(lists.values(), (2, 2, 3), strict=True))
+    return mirror.Hints(near, far, convex, light)
 
 
 def element_sizes(instances: Instances, nodes: pooling.Nodes, spacing: float) -> perspective.Sizes | None:
@@ -242,21 +332,6 @@ def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, para
     return sign_search.Data(nodes.xy, d, covariance, nodes.weight, log_outlier, cue)
 
 
-def sign_votes(xy: Float, g: Float, best: sign_search.Candidate, choice: perspective.Choice) -> dict[str, float]:
-    """Nats by which each cue prefers the surface of gradients `g` (N, 2) to its mirror image.
-
-    Smoothness and shading hold for both alike; what remains is a habit of the world: light comes from above, and things
-    bulge toward the camera. Element size measures it.
-    """
-    votes = {"scale": choice.sign, "light": 0.0, "bulge": 0.0}
-    if best.light is not None and best.shade > 10:
-        c = best.light.direction[2:]
-        votes["light"] = float(-LIGHT_ABOVE * c[1] / max(np.hypot(*c), 1e-12))
-    out = float(((xy - xy.mean(0)) * g).sum())
-    votes["bulge"] = -BULGE * float(np.sign(out))
-    return votes
-
-
 def outputs(
     mask: NDArray[np.bool_],
     instances: Instances,
@@ -289,7 +364,7 @@ def outputs(
     nan = np.float32(np.nan)
     mean = maps["height"][valid].mean() if valid.any() else 0.0
     height = (maps["height"] - mean) / (1 - mean * camera.bend)  # under perspective a change of the unit, as it must be
-    return {
+    return texton_table(instances, g) | {
         "height": np.where(valid, height, nan).astype(np.float32),
         "normals": np.where(valid[..., None], maps["normals"], nan).astype(np.float32),
         "valid": valid,
@@ -328,6 +403,29 @@ def record(candidates: list[sign_search.Candidate], mirror: bool) -> Arrays:
     }
 
 
+def texton_table(instances: Instances, g: Float) -> Arrays:
+    """What the surface of slopes `g` (N, 2) says of every texton used: see `run`."""
+    found, trusted = instances.calibration, instances.trust > 0
+    delivered, _ = tensors.deviator(instances.table["tensor"].astype(float), instances.table["tensor_cov"].astype(float))
+    steep = np.arcsin(np.sqrt(np.clip(np.hypot(*delivered.T), 0, 1)))
+    off = np.degrees(steep - np.arctan(np.hypot(*g.T)))
+    count = len(found.e)
+    bias, reason = np.full(count, np.nan), []
+    for k in range(count):
+        mine = off[(instances.texton == k) & trusted]
+        bias[k] = np.median(mine) if len(mine) else np.nan
+        times = np.sqrt(found.noise[k])
+        words = f"disagrees with its neighbours: {times:.0f} times as far off as it states, and so has next to no say"
+        reason.append(words if found.noise[k] > calibration.DISAGREES else "")
+    return {
+        "texton/part": np.unique(instances.table["texton"]).astype(np.int32),
+        "texton/shear": (found.e / 2).astype(np.float32),
+        "texton/slant_bias": bias.astype(np.float32),
+        "texton/noise": found.noise.astype(np.float32),
+        "texton/reason": np.array(reason),
+    }
+
+
 def posterior_states(instances: Instances, g: Float, spread: Float) -> Float:
     """Posteriors (N, 3) of {+, −, not from the surface} (section 4): + is the sign nearer to the delivered normal."""
     d, covariance = tensors.gradient(instances.calibration.w, instances.covariance)
@@ -344,4 +442,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=5, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=6, params=Params, run=run, inputs=("image", "frontal"))

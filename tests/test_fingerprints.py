@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from sftex_stages import pipeline
 from sftex_stages.engine.hdf5 import encode
 from sftex_stages.engine.plan import Item, Planner
+from sftex_stages.engine.stage import StageParams
 from sftex_stages.engine.store import Store
 from sftex_stages.engine.worker import describe
 
@@ -108,6 +109,9 @@ def others(value, annotation):
         return [number * 1.01, number * 0.99, number + 0.01, 1, 0.5, 2]
     if isinstance(value, tuple | list):
         return [value[:-1], (*value[:-1], value[-1] * 1.01), (*value, value[-1] + 1)]
+    if isinstance(value, StageParams):  # parameters within parameters
+        inner = [(n, v, f.annotation) for (n, v), f in zip(value, type(value).model_fields.values(), strict=True) if v != ()]
+        return [{**value.model_dump(), n: other} for n, v, annotation in inner for other in others(v, annotation)]
     return [value + "x"]
 
 

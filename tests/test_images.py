@@ -348,3 +348,28 @@ def test_decoding_agrees_with_a_second_decoder(tmp_path: Path) -> None:
     write(tmp_path / "a.jpg", smooth, CompressionQuality=90)
     other = cv2.imread(str(tmp_path / "a.jpg"))[..., ::-1]
     np.testing.assert_allclose(load_image(tmp_path / "a.jpg")[0], srgb(other / 255), atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("data", "focal"),
+    [
+        ({"Exif:FocalLengthIn35mmFilm": 50}, 50 * np.hypot(300, 200) / np.hypot(36, 24)),
+        ({"Exif:FocalLength": 24.0, "Exif:FocalPlaneXResolution": 2540.0, "Exif:FocalPlaneResolutionUnit": 2}, 2400.0),
+        ({"Exif:FocalLength": 24.0, "Exif:FocalPlaneXResolution": 1000.0, "Exif:FocalPlaneResolutionUnit": 3,
+          "Exif:PixelXDimension": 600}, 1200.0),
+        ({"Exif:FocalLength": 24.0}, None),
+        ({}, None),
+    ],
+)  # fmt: skip
+def test_focal_length_comes_from_the_exif_data(tmp_path, data, focal):
+    path = tmp_path / "photo.jpg"
+    spec = oiio.ImageSpec(300, 200, 3, oiio.UINT8)
+    for name, value in data.items():
+        spec.attribute(name, "int" if isinstance(value, int) else "float", value)
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec) and out.write_image(np.full((200, 300, 3), 128, np.uint8)) and out.close()
+    arrays = images.run({"image": path, "mask": None}, images.Params())
+    if focal is None:
+        assert "focal_px" not in arrays
+    else:
+        assert float(arrays["focal_px"]) == pytest.approx(focal, rel=1e-3)

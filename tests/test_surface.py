@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 from synthetic_instances import instances_of, jittered
 
-from sftex_stages import surface
-from sftex_stages.errors import StageError
+from sftex_stages import config, surface
+from sftex_stages.errors import ConfigError, StageError
 from sftex_stages.geometry import perspective, tensors
 
 SHAPE = (300, 360)
+QUICK = {"finalists": 1, "camera": "orthographic", "nodes": 250}
 
 
 def image(mask=None):
@@ -57,6 +58,21 @@ def test_outputs_are_as_documented(found):
     assert (normal * stored).sum(-1).min() > 0.999
     evidence = found["candidate/shape"] + found["candidate/shading"]
     assert evidence[0] == evidence[found["candidate/tuned"]].max()
+
+
+def test_textons_are_told_what_the_surface_says_of_them():
+    xy = jittered(SHAPE, 12)
+    parts = instances_of((xy, bumps(xy)), noise=0.004, textons=6)
+    wrong = parts[4]["transform"] @ np.array([[1.08, 0.0], [0.0, 0.92]], np.float32)
+    s = wrong @ np.swapaxes(wrong, 1, 2)
+    s /= np.linalg.eigvalsh(s)[:, 1][:, None, None]
+    parts[4] |= {"transform": wrong, "tensor": np.stack((s[:, 0, 0], s[:, 0, 1], s[:, 1, 1]), 1)}
+    out = surface.run({"image": image(), "frontal": parts}, surface.Params(**QUICK))
+    assert out["texton/part"].tolist() == list(range(6)) and (out["texton/reason"] == "").all()
+    assert np.abs(out["texton/shear"][4] - [-0.08, 0]).max() < 0.015
+    assert np.abs(np.delete(out["texton/shear"], 4, 0)).max() < 0.02
+    assert np.abs(np.delete(out["texton/slant_bias"], 4)).max() < 1 and out["texton/noise"].shape == (6,)
+    assert np.median(angles(out, bumps)) < 1
 
 
 def test_sigma_is_of_the_size_of_the_error(found):
@@ -175,7 +191,7 @@ def test_element_sizes_give_focal_length_sign_and_normals_in_the_cameras_frame(s
     assert str(out["camera"]) == "perspective"
     assert float(out["focal_px"]) == pytest.approx(500, rel=1e-9 if given else 0.1)
     assert tuple(out["principal_point"]) == camera.centre
-    assert float(out["vote/scale"]) > 50
+    assert out["vote/scale"].shape == (1,) and out["vote/scale"][0] > 50
     at = np.rint(xy).astype(int)
     inside = out["valid"][at[:, 1], at[:, 0]]
     truth = camera.turn(xy, tensors.normals(camera.slopes(xy, slope)))
@@ -190,4 +206,100 @@ def test_element_sizes_give_focal_length_sign_and_normals_in_the_cameras_frame(s
 
 def test_orthography_can_be_asked_for(sheet):
     out = surface.run({"image": image(), "frontal": sheet[3]}, surface.Params(camera="orthographic"))
-    assert str(out["camera"]) == "orthographic" and np.isinf(out["focal_px"]) and out["vote/scale"] == 0
+    assert str(out["camera"]) == "orthographic" and np.isinf(out["focal_px"]) and not out["vote/scale"].any()
+
+
+def test_focal_length_of_the_photograph_is_taken(sheet):
+    own = image() | {"focal_px": np.array(500.0)}
+    out = surface.run({"image": own, "frontal": sheet[3]}, surface.Params(finalists=1, nodes=250))
+    assert float(out["focal_px"]) == pytest.approx(500) and out["vote/scale"][0] > 50
+    out = surface.run({"image": own, "frontal": sheet[3]}, surface.Params(**QUICK))
+    assert str(out["camera"]) == "orthographic"
+
+
+def as_given(out, gradient):
+    """Share of valid pixels whose sign is right."""
+    x, y = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
+    truth = tensors.normals(gradient(np.stack((x, y), -1).astype(float)))[out["valid"]]
+    return ((truth[:, :2] * out["normals"][out["valid"]][:, :2]).sum(1) >= 0).mean()
+
+
+@pytest.mark.parametrize(
+    ("hints", "sign"),
+    [
+        ({"near": [[180, 150]]}, 1),
+        ({"far": [[180, 150]]}, -1),
+        ({"near": [[20, 20]], "far": [[180, 150]]}, -1),
+        ({"convex": [[180, 150, 60]]}, 1),
+    ],
+)
+def test_hints_decide_between_a_dome_and_a_hollow(hints, sign):
+    xy = jittered(SHAPE, 24)
+    dome = lambda at: sign * (np.array([180.0, 150.0]) - at) / 220  # noqa: E731
+    part = instances_of((xy, dome(xy)), noise=0.005)
+    params = surface.Params(hints=surface.HintParams.model_validate(hints), **QUICK)
+    out = surface.run({"image": image(), "frontal": part}, params)
+    assert as_given(out, dome) > 0.98 and out["vote/hint"][0] > 100 and out["mirror_margin"][0] > 100
+
+
+def test_a_hint_where_the_light_comes_from_overrules_the_habit_of_light_from_above():
+    xy = jittered(SHAPE, 16)
+    n = tensors.normals(bumps(xy))
+    parts = instances_of((xy, bumps(xy)), noise=0.005, light=0.5 + 0.4 * n[:, 2] + 0.35 * n[:, 1] + 0.15 * n[:, 0])
+    params = surface.Params(hints=surface.HintParams(light=-67.0), finalists=1, camera="orthographic")
+    out = surface.run({"image": image(), "frontal": parts}, params)
+    assert as_given(out, bumps) > 0.97 and out["light"][3] > 0.2
+
+
+def test_pieces_that_lie_apart_have_signs_and_votes_of_their_own():
+    xy = jittered(SHAPE, 14)
+    xy = xy[np.abs(xy[:, 0] - 180) > 50]
+    centre = lambda at: np.where(at[..., :1] < 180, 65.0, 295.0) * [1, 0] + [0, 150.0]  # noqa: E731
+    pair = lambda at: np.where(at[..., :1] < 180, -1, 1) * (at - centre(at)) / 180  # noqa: E731
+    hints = surface.HintParams(near=((65.0, 150.0),), far=((295.0, 150.0),))
+    out = surface.run(
+        {"image": image(), "frontal": instances_of((xy, pair(xy)), noise=0.005)}, surface.Params(hints=hints, **QUICK)
+    )
+    assert out["piece"].max() == 2 and out["piece"][150, 65] != out["piece"][150, 295]
+    assert as_given(out, pair) > 0.97
+    assert all(out[f"vote/{cue}"].shape == (2,) for cue in ("scale", "light", "bulge", "hint", "smoothness", "shading"))
+    assert (out["vote/hint"] > 100).all() and sorted(out["vote/bulge"].tolist()) == [-0.5, 0.5]
+    assert out["region_margin"].shape == (2,) and (out["region_margin"] > 5).all()
+
+
+@pytest.mark.parametrize("start", ["cylinder", "sphere", "plane"])
+def test_start_shape_can_be_chosen(start):
+    xy = jittered(SHAPE, 24)
+    dome = lambda at: (np.array([180.0, 150.0]) - at) / 220  # noqa: E731
+    parts = instances_of((xy, dome(xy)), noise=0.005)
+    out = surface.run({"image": image(), "frontal": parts}, surface.Params(start=start, **QUICK))
+    assert all(str(name).startswith(start) for name in out["candidate/origin"])
+    assert np.median(angles(out, dome)) < 1.5
+
+
+def test_a_hint_outside_of_the_image_is_refused():
+    parts = instances_of((jittered(SHAPE, 40), bumps(jittered(SHAPE, 40))))
+    params = surface.Params(hints=surface.HintParams(far=((400.0, 20.0),)))
+    with pytest.raises(StageError, match=r"surface\.hints\.far: the point \[400, 20\] lies outside .* 360 x 300"):
+        surface.run({"image": image(), "frontal": parts}, params)
+
+
+@pytest.mark.parametrize(
+    ("yaml", "words"),
+    [
+        ("hints: {near: [[1, 2, 3]]}", "surface.hints.near"),
+        ("hints: {convex: [[1, 2, 0]]}", "surface.hints.convex.0.2: should be greater than 0"),
+        ("hints: {lihgt: 90}", "surface.hints.lihgt: unknown key"),
+        ("start: cone", "surface.start"),
+    ],
+)
+def test_mistakes_in_hints_name_their_key_and_line(yaml, words):
+    with pytest.raises(ConfigError) as error:
+        config.parse(f"surface:\n  {yaml}\n", [surface.STAGE])
+    assert words in str(error.value) and str(error.value).startswith("pipeline.yaml:2:")
+
+
+def test_hints_are_read_from_yaml():
+    text = "surface:\n  hints:\n    near: [[10, 20.5]]\n    light: 90\n"
+    hints = config.parse(text, [surface.STAGE])["surface"].hints
+    assert hints.near == ((10.0, 20.5),) and hints.light == 90 and hints.far == ()

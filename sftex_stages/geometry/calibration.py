@@ -1,12 +1,12 @@
 """Textons judge one another before any surface is known.
 
 The tensors of all instances sample one smooth field w(x), whatever their signs (`tensors.py`). What a texton's metric upgrade
-got wrong is common to its instances: its frontal frame is sheared by some I + e_k, so that w(T_i (I + e_k) T_iᵀ), and not
+got wrong is common to its instances: its frontal frame is sheared by some I + e_k / 2, so that w(T_i (I + e_k) T_iᵀ), and not
 w(T_i T_iᵀ), agrees with the neighbours of other textons: linear in the two numbers of the traceless symmetric e_k. A texton
 that agrees with no one gets a large noise factor, and thereby no say.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ SHEAR = 0.06  # standard deviation of e_k a priori: metric upgrades are off by a
 FREEDOM = 3.0
 # What all textons have wrong together: so many standard errors of the mean shear, were the shears independent.
 COMMON = 2.0
+OWN_SAY = 0.25
+DISAGREES = 25.0  # noise factor from which a texton is said to disagree: errors of five times what it states
 MEMBERS = 4.0  # instances' worth of prior that a texton's noise is as stated
 
 
@@ -55,8 +57,8 @@ def shear_effect(transform: Float) -> tuple[Float, Float]:
 
 
 def scales(transform: Float, e: Float) -> Float:
-    """Largest singular values (N,) of transforms (N, 2, 2) corrected by shears `e` (N, 2)."""
-    shear = np.eye(2) + np.stack((e, np.stack((e[:, 1], -e[:, 0]), 1)), 1)
+    """Largest singular values (N,) of transforms (N, 2, 2) corrected by shears `e` (N, 2), half of them in the frame."""
+    shear = np.eye(2) + np.stack((e, np.stack((e[:, 1], -e[:, 0]), 1)), 1) / 2
     return np.asarray(np.linalg.svd(transform @ shear, compute_uv=False)[:, 0])
 
 
@@ -127,3 +129,29 @@ def calibrate(
     total = np.bincount(texton, trust, count) / noise
     common = COMMON * np.sqrt(total**2 @ variance_of_shear) / total.sum()
     return Calibration(e, noise, current, robust, float(common))
+
+
+def against_surface(
+    found: Calibration, transform: Float, covariance: Float, texton: Int, trust: Float, w: Float, rounds: int = 4
+) -> Calibration:
+    """The same with shears that fit a finished surface, which shows w (N, 2) at the instances.
+
+    Neighbours see a texton's shear through a handful of witnesses each; the surface has all of them in it, and the signs.
+    `covariance` (N, 2, 2) of w holds the textons' noise already. A texton that makes up more of the surface than
+    `OWN_SAY` would be its own witness, and keeps its shear.
+    """
+    raw, effect = shear_effect(transform)
+    variance = np.trace(covariance, axis1=1, axis2=2) / 2
+    count, current = len(found.e), found.w
+    say = trust / variance
+    own = np.bincount(texton, say, count) > OWN_SAY * say.sum()
+    for _ in range(rounds):
+        chi2 = ((w - current) ** 2).sum(1) / variance
+        say = trust / variance * (FREEDOM + 2) / (FREEDOM + chi2)
+        normal, right = np.zeros((count, 2, 2)), np.zeros((count, 2))
+        np.add.at(normal, texton, say[:, None, None] * np.swapaxes(effect, 1, 2) @ effect)
+        np.add.at(right, texton, say[:, None] * np.einsum("nji,nj->ni", effect, w - raw))
+        fitted = np.linalg.solve(normal + np.eye(2) / SHEAR**2, right[..., None])[..., 0]
+        e = np.where(own[:, None], found.e, fitted)
+        current = raw + np.einsum("nij,nj->ni", effect, e[texton])
+    return replace(found, e=e, w=current)

@@ -14,13 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sftex_stages.geometry import gaussian, refine, spline
+from sftex_stages.geometry import blocks, gaussian, refine, spline
 
 Float = NDArray[np.floating]
 
 TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
 OFF = (1.0, 0.2, 0.2)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
+SCREEN = 25.0  # nats by which sizes must follow the heights seen under orthography to be asked any further
+FREEDOM = 4.0  # of the Student distribution of sizes in that
 GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
 
 
@@ -130,6 +132,27 @@ class Sizes:
         return max(height.over(float(k)).unrelated() for k in np.geomspace(*refine.HEIGHT_FACTORS, 30))
 
 
+    def follow(self, w: Float, h: Float) -> float:
+        """Nats by which log size goes linearly with heights `h` (M,) px, beyond its constant and what the slant explains.
+
+        Profile likelihoods of Student noise, one scale for all; `w` (M, 2) of the nodes.
+        """
+        steep, root = np.hypot(w[:, 0], w[:, 1]), np.sqrt(self.trust / self.variance)
+        columns = np.stack((np.ones_like(h), steep, steep**2, h - h.mean()), 1) * root[:, None]
+        y, cost = self.value * root, []
+        for x in (columns[:, :3], columns):
+            weight = np.ones(len(y))
+            for _ in range(6):
+                half = np.sqrt(weight)[:, None]
+                r = y - x @ np.linalg.lstsq(x * half, y * half[:, 0])[0]
+                scale = max(float(np.average(r**2, weights=weight)), 1e-12)
+                weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
+            trials = scale * np.geomspace(0.05, 20, 40)
+            student = 0.5 * (FREEDOM + 1) * np.log1p(r[:, None] ** 2 / trials / FREEDOM) + 0.5 * np.log(trials)
+            cost.append(float(student.sum(0).min()))
+        return cost[0] - cost[1]
+
+
 @dataclass(frozen=True)
 class Choice:
     """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind)."""
@@ -173,6 +196,14 @@ def choose(
         value = refine.refine(f, flat, spread, sizes.trust, sign * start, smooth, 3, height).evidence
         return value - (np.log(bend) * (sizes.trust > 0).sum() if sized else 0.0)  # density of sizes, not of heights
 
+    if bend is None:
+        rough = gaussian.make_field(grid, xy)
+        firm = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
+        factor = gaussian.posterior(rough, firm, gaussian.prior(rough, smooth))
+        h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
+        told = sizes.follow(w, h)
+        if told < SCREEN:
+            return Choice(Camera(centre, 0.0), told, 0.0)
     flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w, np.zeros(len(w))) if bend is None else 0.0
     found: dict[float, float] = {}
     sign = 0.0

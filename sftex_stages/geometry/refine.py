@@ -77,6 +77,7 @@ def refine(
     smooth: gaussian.Smoothness,
     rounds: int = 4,
     height: gaussian.Heights | None = None,
+    noise: float = 1.0,
 ) -> Solution:
     """The surface from tensors `w` (N, 2) with `covariance` (N, 2, 2), trusted by `trust` (N,) in 0…1.
 
@@ -86,12 +87,14 @@ def refine(
         gradients with their signs decided; only where it starts, the tensors decide the rest.
     rounds : int
         of: smoothness and noise by one pattern search step, two Gauss-Newton steps, new robust weights.
+    noise
+        factor on `covariance` to start from.
     height
         heights, their precisions up to one noise factor, if they are measured (element size under perspective).
     """
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
-    x, pace = np.log([smooth.strength, smooth.reach, 1.0]), np.array([0.7, 0.7, 0.7])
+    x, pace = np.log([smooth.strength, smooth.reach, noise]), np.array([0.7, 0.7, 0.7])
     if height is not None:
         x, pace = np.append(x, np.log(2.0)), np.append(pace, 0.7)
 

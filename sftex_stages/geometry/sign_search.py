@@ -62,13 +62,13 @@ class Candidate:
 
 
 def starts(data: Data) -> tuple[Float, list[str]]:
-    """Signs (N, S) of simple shapes: cylinders (section 4, "Starting the method"), leaning planes, a bowl, lit shapes."""
+    """Signs (N, S) of simple shapes: cylinders (section 4, "Starting the method"), leaning planes, a bulge."""
     centred = data.xy - np.median(data.xy, 0)
     angle = np.arange(4) * np.pi / 4
     axis = np.stack((np.cos(angle), np.sin(angle)))
     lean = data.d @ axis
     columns = [-(centred @ axis) * lean, lean, -(centred * data.d).sum(1, keepdims=True)]
-    names = [f"{kind} {45 * k}°" for kind in ("cylinder", "plane") for k in range(4)] + ["bowl"]
+    names = [f"{kind} {45 * k}°" for kind in ("cylinder", "plane") for k in range(4)] + ["sphere"]
     return np.where(np.concatenate(columns, 1) < 0, -1.0, 1.0), names
 
 
@@ -204,13 +204,19 @@ def distinct(patterns: Float, trust: Float, limit: float = 0.99) -> list[int]:
     return keep
 
 
-def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, survivors: int = 10) -> list[Candidate]:
+def search(
+    data: Data, f: gaussian.Field, spacing: float, finalists: int, start: str = "auto", survivors: int = 10
+) -> list[Candidate]:
     """Sign patterns, best first: `finalists` whose settings were tuned, then those that fell behind.
 
-    `f` has the points of `data`, on a grid about as fine as their mean `spacing` (px).
+    `f` has the points of `data`, on a grid about as fine as their mean `spacing` (px). `start`: "auto", or the one kind of
+    shape to start from, "cylinder", "sphere" or "plane".
     """
     weight = np.linalg.inv(data.covariance) * data.trust[:, None, None]
     patterns, names = starts(data)
+    if start != "auto":
+        kind = [k for k, name in enumerate(names) if name.startswith(start)]
+        patterns, names = patterns[:, kind], [names[k] for k in kind]
     pairs = neighbours(data.xy)
     labels = [patches(data, pairs, level) for level in (0.15, 0.3)]
     lit = np.zeros(len(names), bool)
@@ -218,8 +224,8 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
     for k, (strength, reach) in enumerate(LADDER):
         smooth = gaussian.Smoothness(strength, reach * spacing)
         c = signs.coupling(f, data.d, weight, smooth)
-        spectral = signs.spectral_starts(c, 3) if k < 2 else patterns[:, :0]
-        shaded, labels_lit = lit_starts(data)
+        spectral = signs.spectral_starts(c, 3) if k < 2 and start == "auto" else patterns[:, :0]
+        shaded, labels_lit = lit_starts(data) if start == "auto" else (patterns[:, :0], [])
         patterns = np.concatenate((patterns, spectral, shaded), 1)
         names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_lit
         lit = np.concatenate((lit, np.zeros(spectral.shape[1], bool), np.ones(shaded.shape[1], bool)))
@@ -236,7 +242,7 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
         pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
     first = [judge(data, f, s, smooth, 1.0, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
-    moved = [settle(data, f, x)[0] for x in first[:finalists]]
+    moved = [settle(data, f, x) for x in first[:finalists]]
     last = [
         judge(data, f, moved[k], first[k].smooth, first[k].noise, 2, first[k].origin)
         for k in distinct(np.stack(moved, 1), data.trust, 0.995)
@@ -244,14 +250,32 @@ def search(data: Data, f: gaussian.Field, spacing: float, finalists: int, surviv
     return sorted(last, key=lambda x: -x.evidence) + first[finalists:]
 
 
-def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) -> tuple[Float, Float]:
-    """The signs (N,) of `found` after flips of regions of all sizes, as long as one helps; and how sure each is (N,).
-
-    Energies are those of its own smoothness, noise and outliers. How sure: the nats by which the best rival pattern is worse
-    that differs there (`sign_regions.py`).
-    """
+def own_coupling(data: Data, f: gaussian.Field, found: Candidate) -> signs.Coupling:
+    """The coupling at the candidate's own smoothness and noise, without its outliers."""
     weight = np.linalg.inv(data.covariance) * (found.inside / found.noise)[:, None, None]
-    c = signs.coupling(f, data.d, weight, found.smooth)
+    return signs.coupling(f, data.d, weight, found.smooth)
+
+
+def rivals(data: Data, c: signs.Coupling, s: Float) -> tuple[list[Int], Float]:
+    """Regions that rival patterns of `s` (N,) turn, and by how many nats (R,) they are worse (`sign_regions.py`)."""
+    bias = bias_of(data, s[:, None], np.ones(1, bool), [None])[:, 0]
+    return sign_regions.rivals(c, data.d, s, bias, neighbours(data.xy))
+
+
+def ties(data: Data, c: signs.Coupling, s: Float, piece: Int) -> tuple[Float, Float]:
+    """Nats (P, P) by which smoothness ties the pieces (N,) of a pattern `s` (N,) together, and (P,) shading to its light."""
+    member = np.zeros((len(s), int(piece.max()) + 1))
+    member[np.arange(len(s)), piece] = s
+    bias = bias_of(data, s[:, None], np.ones(1, bool), [None])[:, 0]
+    return member.T @ signs.product(c, member), member.T @ bias
+
+
+def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) -> Float:
+    """The signs (N,) of `found` after flips of regions of all sizes, as long as one helps.
+
+    Energies are those of its own smoothness, noise and outliers.
+    """
+    c = own_coupling(data, f, found)
     pairs, s, lit = neighbours(data.xy), found.s, np.ones(1, bool)
     for _ in range(rounds):
         bias = bias_of(data, s[:, None], lit, [None])[:, 0]
@@ -265,18 +289,21 @@ def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) ->
     # What did not fit the former pattern had no say, and no energy of its own: it follows the surface.
     g = gaussian.gradients(f, signs.surface_of(c, s))
     lost = (found.inside < 0.5 * data.trust) & ((data.d * g).sum(1) * s < 0)
-    return np.where(lost, -s, s), sign_regions.margins(regions, rise, len(s))
+    return np.where(lost, -s, s)
 
 
-def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int) -> list[Candidate]:
-    """The signs that the paper's EM finds from a cylinder in four directions (it was aligned by hand), judged alike."""
+def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int, start: str = "auto") -> list[Candidate]:
+    """The signs that the paper's EM finds, judged alike: from a cylinder in four directions (it was aligned by hand), or from
+    the `start` "sphere", or planes in four directions."""
     smooth = gaussian.Smoothness(1.0, 2.0 * spacing)
     found = []
-    for k in range(4):
-        start = surface_em.cylinder(data.xy, k * np.pi / 4)
-        result = surface_em.run(data.xy, data.d, data.covariance, data.log_outlier, start, EM_SPACING * spacing)
+    kind = "cylinder" if start == "auto" else start
+    shape = getattr(surface_em, kind)
+    for k in range(1 if start == "sphere" else 4):
+        g = shape(data.xy, k * np.pi / 4)
+        result = surface_em.run(data.xy, data.d, data.covariance, data.log_outlier, g, EM_SPACING * spacing)
         s = np.where(result.state[:, 0] < result.state[:, 1], -1.0, 1.0)
-        found.append(judge(data, f, s, smooth, 1.0, 1, f"em, cylinder {45 * k}°"))
+        found.append(judge(data, f, s, smooth, 1.0, 1, f"em, {kind} {45 * k}°"))
     return sorted(found, key=lambda x: -x.evidence)[:finalists]
 
 

@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, Delaunay, cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from sftex_stages.geometry import confidence, gaussian, spline, tensors
 
 Float = NDArray[np.floating]
 
-GAPS = 2.7  # reach of a measurement, in the typical (median) distance of a point from its nearest measurement
+GAPS = 4.0  # reach of a measurement, in the typical (median) distance of a point from its nearest measurement
 BEYOND = 0.5  # of that reach, where measurements lie on one side only: past a border, or a silhouette
 WORST = 30.0  # degrees; a normal less certain than this is not reported
 
@@ -21,11 +21,16 @@ def typical_gap(xy: Float, spacing: float) -> float:
     low, high = xy.min(0), xy.max(0)
     axes = [np.linspace(low[k], high[k], 60) for k in range(2)]
     points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-    hull = xy[ConvexHull(xy, qhull_options="QJ").vertices]
-    inside = Delaunay(hull, qhull_options="QJ").find_simplex(points) >= 0
+    sides = ConvexHull(xy, qhull_options="QJ").equations
+    inside = (points @ sides[:, :2].T + sides[:, 2] <= 0).all(1)
     if not inside.any():
         return spacing
     return float(np.quantile(cKDTree(xy).query(points[inside])[0], 0.5))
+
+
+def reach(xy: Float, spacing: float) -> float:
+    """How far, px along the surface, measurements at `xy` (N, 2), pooled with that spacing, speak for it."""
+    return GAPS * max(typical_gap(xy, spacing), 0.4 * spacing)
 
 
 def distance(seen: Float, at: Float) -> Float:
@@ -73,8 +78,7 @@ def dense(
     height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(f.grid, xy)
     seen = np.concatenate((xy, (stencil * a[index]).sum(1, keepdims=True)), 1)
-    reach = GAPS * max(typical_gap(xy, spacing), 0.4 * spacing)
-    far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach
+    far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach(xy, spacing)
     far /= np.where(surrounded(xy, points).reshape(far.shape), 1.0, BEYOND)
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {

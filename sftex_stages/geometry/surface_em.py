@@ -47,6 +47,18 @@ def cylinder(xy: Float, azimuth: float) -> Float:
     return -(t / np.sqrt(1 - t**2))[:, None] * axis
 
 
+def sphere(xy: Float, _azimuth: float = 0.0) -> Float:
+    """Gradient (N, 2) of a sphere over `xy` (N, 2), through their centroid."""
+    t = xy - xy.mean(0)
+    t = t / (1.05 * np.linalg.norm(t, axis=1).max() + 1e-12)
+    return np.asarray(-t / np.sqrt(1 - (t**2).sum(1, keepdims=True)))
+
+
+def plane(xy: Float, azimuth: float) -> Float:
+    """Gradient (N, 2) of a plane that falls toward `azimuth` by 45 degrees."""
+    return np.tile([-np.cos(azimuth), -np.sin(azimuth)], (len(xy), 1))
+
+
 def posterior(d: Float, precision: Float, g: Float, log_outlier: Float, share: float) -> tuple[Float, Float]:
     """E step: posteriors (N, 3) of the states at gradients `g` (N, 2), and log likelihoods (N,)."""
     logdet = np.linalg.slogdet(precision)[1]

@@ -116,6 +116,14 @@ def test_sizes_that_follow_the_slant_prove_no_perspective(view):
     assert choice.camera.bend == 0 and choice.sign == 0 and choice.gain < perspective.GAIN
 
 
+def test_sizes_follow_depth_or_do_not(view):
+    _, xy, w, _, sizes, _ = problem(view, 0.01, CAMERA)
+    assert sizes.follow(w, h_of(xy)) > 10 * perspective.SCREEN
+    assert sizes.follow(w, -3 * h_of(xy)) == pytest.approx(sizes.follow(w, h_of(xy)), rel=1e-3)
+    _, xy, w, _, sizes, _ = problem(view, 0.01, perspective.Camera(CENTRE, 0.0))
+    assert sizes.follow(w, h_of(xy)) < perspective.SCREEN
+
+
 def test_heights_are_integrated_out_as_a_dense_gaussian():
     rng = np.random.default_rng(3)
     xy = rng.uniform(0, 60, (12, 2))

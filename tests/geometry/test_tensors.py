@@ -76,6 +76,22 @@ def test_textons_correct_one_another():
     assert np.median(after[~wrong]) < 0.01
 
 
+def test_the_finished_surface_finds_what_is_left_of_a_shear():
+    xy, transform, texton, truth = field_of_transforms()
+    wrong, shear = texton == 2, np.array([[1.04, 0.02], [0.02, 0.96]])
+    transform[wrong] = transform[wrong] @ shear
+    covariance, count = np.tile(1e-5 * np.eye(2), (len(xy), 1, 1)), int(texton.max()) + 1
+    nothing = np.zeros((count, 2))
+    raw = calibration.shear_effect(transform)[0]
+    start = calibration.Calibration(nothing, np.ones(count), raw, np.ones(len(xy)), 0.0)
+    args = transform, covariance, texton, np.ones(len(xy))
+    found = calibration.against_surface(start, *args, truth)
+    assert np.median(np.linalg.norm(found.w - truth, axis=1)[wrong]) < 0.005
+    assert np.allclose(found.e[2], [-0.084, -0.043], atol=0.004) and np.abs(np.delete(found.e, 2, 0)).max() < 0.003
+    lonely = calibration.against_surface(start, transform, covariance, np.minimum(texton, 1) * 0 + wrong, args[3], truth)
+    assert not lonely.e[0].any()  # it is most of what the surface was made from
+
+
 def test_a_texton_that_agrees_with_no_one_loses_its_say():
     xy, transform, texton, _ = field_of_transforms()
     rng = np.random.default_rng(5)
