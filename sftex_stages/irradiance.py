@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -30,6 +30,9 @@ class Params(StageParams):
     noise_floor: float = Field(0.01, gt=0, le=1, description="Least relative error of an irradiance that is believed")
     nodes: int = Field(
         2000, ge=50, le=20000, description="Most cells that instances are pooled in to find the smoothness"
+    )
+    channels: Literal["one", "rgb"] = Field(
+        "one", description="One map for all channels; or rgb: beside it a map of each channel, for coloured light"
     )
     plain: bool = Field(True, description="Take the light between elements from plain print of one colour, as far as it agrees")
     detail: float = Field(0.8, gt=0.2, le=4, description="Spacing of the field's grid, in spacings of those cells")
@@ -65,6 +68,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     map (H, W) relative irradiance, geometric mean 1 over valid pixels, and sigma (H, W), expected error of its logarithm; NaN
     elsewhere; class_scale (K,) r_k, NaN for textons without an accepted instance; instance/irradiance (N,) r_k L_i on the
     map's scale; instance/weight (N,) robust weights; noise_factor, by which instances scatter more than they say, squared;
+    with channels = rgb also rgb (H, W, 3), each channel's irradiance, up to a constant of its own.
     plain_share (4,), how much of what plain print says was believed at each scale, from coarse to fine (`ground.py`).
 
     Raises
@@ -101,8 +105,13 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     scale[present] = np.exp(-result.offset - mean)
     weight = np.zeros(len(light))
     weight[used] = result.weight
-    return {
-        "map": np.exp(log_map - mean).astype(np.float32),
+    light_map = np.exp(log_map - mean).astype(np.float32)
+    extra = {}
+    if params.channels == "rgb":
+        channel = np.log(np.maximum(surface["instance/irradiance_rgb"][used].astype(float), 1e-9))
+        extra["rgb"] = light_map[..., None] * _tint(every, channel - np.log(light[used])[:, None], index, piece, params)
+    return extra | {
+        "map": light_map,
         "sigma": np.hypot(actual[1] * log_sigma, max(actual[0], field.POOLED_FLOOR)).astype(np.float32),
         "class_scale": scale.astype(np.float32),
         "instance/irradiance": (light * scale[texton]).astype(np.float32),
@@ -131,6 +140,21 @@ def _by_pieces(of: Instances, piece: Int, result: field.Irradiance, params: Para
         log_map[box][here] = value[here] + level
         log_sigma[box][here] = error[here]
     return log_map, log_sigma
+
+
+def _tint(of: Instances, log_ratio: Float, texton: Int, piece: Int, params: Params) -> Float:
+    """Irradiance of each channel over that of all (H, W, 3) float32, geometric mean 1, NaN off the surface.
+
+    log_ratio (N, 3) at the instances, up to a constant for each texton (N,) and channel: the print's own colour.
+    """
+    tint = np.full((*piece.shape, 3), np.nan, np.float32)
+    for c in range(3):
+        of_channel = replace(of, log=log_ratio[:, c], texton=texton)
+        result = _fit(of_channel, params)
+        of_channel = of_channel.on_one_scale(result.offset)
+        value, _ = _by_pieces(of_channel, piece, result, params)
+        tint[..., c] = np.exp(value - np.nanmean(value)) if piece.any() else np.nan
+    return tint
 
 
 def _checked(
@@ -207,4 +231,4 @@ def _maps(found: field.Irradiance, box: tuple[slice, slice]) -> tuple[Float, Flo
     return value, cv2.remap(coarse.astype(np.float32), *np.meshgrid(*at), cv2.INTER_LINEAR)
 
 
-STAGE = Stage(name="irradiance", version=3, params=Params, run=run, inputs=("image", "surface"))
+STAGE = Stage(name="irradiance", version=4, params=Params, run=run, inputs=("image", "surface"))

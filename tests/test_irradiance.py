@@ -130,3 +130,20 @@ def test_plain_print_adds_what_lies_between_instances_unless_they_disagree():
     stained = cloth * np.exp(0.3 * np.sin(x / 11) * np.cos(y / 13))[..., None]
     wrong = run(surface, stained.astype(np.float32))
     assert error(wrong).mean() < 1.5 * error(alone).mean() and wrong["plain_share"].max() < 0.6
+
+
+def test_coloured_light_has_a_map_of_each_channel():
+    """Warm on the left, cold on the right; every texton has a colour of its own, which is not light."""
+    surface, _ = surface_of(900, noise=0.005, seed=6)
+
+    def tint(x):
+        return np.stack([1.3 - 0.6 * x / SHAPE[1], np.ones_like(x), 0.7 + 0.6 * x / SHAPE[1]], -1)
+
+    print_ = np.array([[1.0, 0.5, 0.2], [0.3, 0.9, 0.6], [1, 1, 1], [0.2, 0.4, 1.0]])
+    colour = tint(surface["instance/xy"][:, 0]) * print_[surface["instance/texton"]]
+    surface["instance/irradiance_rgb"] = (surface["instance/irradiance"][:, None] * colour).astype(np.float32)
+    assert "rgb" not in run(surface)
+    out = run(surface, channels="rgb")
+    y, x = np.nonzero(np.isfinite(out["map"]))
+    ratio = np.log(out["rgb"][y, x] / (field(x, y)[:, None] * tint(x.astype(float))))
+    assert (np.quantile(np.abs(ratio - np.median(ratio, axis=0)), 0.95, axis=0) < 0.02).all()

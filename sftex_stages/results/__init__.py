@@ -35,7 +35,7 @@ FILES = {
     "textons.png": "the frontal textons after 1, 5, 10 and 20 iterations",
     "height.exr": "float32, channel Z, px toward the camera, NaN where unsupported",
     "normals.exr": "float32, channels N.X N.Y N.Z (x right, y down, z toward the camera), NaN where unsupported",
-    "irradiance.exr": "float32, channels Y, relative, geometric mean 1, and sigma, of its logarithm; NaN where unsupported",
+    "irradiance.exr": "float32, channels Y, relative, geometric mean 1, sigma, of its logarithm (R G B if asked for); else NaN",
     "albedo.exr": "float32, linear, channels R G B A: the photograph over the irradiance; A is 0 where unsupported",
     "surface.jpg": "the albedo, flattened by the chart: texture of surface.ply and surface.obj",
     "surface.ply": "mesh in px: x right, y up, z toward the viewer; normals, albedo, coordinates in surface.jpg",
@@ -98,8 +98,11 @@ def _contents(arrays: Mapping[str, Any], meta: Mapping[str, Any], scratch: Path)
     yield "textons.png", _png(pictures.textons(frontal, counts))
     yield "height.exr", exports.exr(height, ("Z",), f"height, px toward the camera; {about}", scratch)
     yield "normals.exr", exports.exr(normals, ("N.X", "N.Y", "N.Z"), f"unit normals; {about}", scratch)
-    both = np.dstack([light["map"], light["sigma"]])
-    yield "irradiance.exr", exports.exr(both, ("Y", "sigma"), f"relative linear irradiance; {about}", scratch)
+    channels = {"Y": light["map"], "sigma": light["sigma"]}
+    if "rgb" in light:
+        channels |= {name: light["rgb"][..., c] for c, name in enumerate("RGB")}
+    planes = np.dstack(list(channels.values()))
+    yield "irradiance.exr", exports.exr(planes, tuple(channels), f"relative linear irradiance; {about}", scratch)
     layers = np.dstack([np.where(seen[..., None], bare, 0), seen])
     yield "albedo.exr", exports.exr(layers, ("R", "G", "B", "A"), f"linear albedo on the image's scale; {about}", scratch)
     mesh = make_mesh(height, normals, surface["piece"], arrays["chart"]["uv"], camera)

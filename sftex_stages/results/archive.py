@@ -32,6 +32,7 @@ class Entry(NamedTuple):
     axes: str
     unit: str
     about: str
+    optional: bool = False
 
 
 SCHEMA = {
@@ -48,6 +49,9 @@ SCHEMA = {
     "surface/normal_sigma": Entry("f4", "H W", "degree", "expected error of the normal"),
     "irradiance/map": Entry("f4", "H W", "relative", "linear irradiance, geometric mean 1 over valid, else NaN"),
     "irradiance/sigma": Entry("f4", "H W", "1", "expected error of the logarithm of irradiance/map, else NaN"),
+    "irradiance/rgb": Entry(
+        "f4", "H W 3", "relative", "only with irradiance.channels = rgb: of each channel, each with geometric mean 1", True
+    ),
     "chart/uv": Entry("f4", "H W 2", "px", "flat coordinates, each piece's own: px of the surface seen straight on, else NaN"),
     "chart/angular": Entry("f4", "P 2", "degree", "a piece's distortion of angles: median, 95th percentile over its area"),
     "chart/area": Entry("f4", "P 2", "1", "a piece's relative distortion of areas: median, 95th percentile over its area"),
@@ -91,6 +95,7 @@ class Result:
     normal_sigma: np.ndarray  # (H, W) degrees
     irradiance: np.ndarray  # (H, W) relative
     irradiance_sigma: np.ndarray  # (H, W) of its logarithm
+    irradiance_rgb: np.ndarray | None  # (H, W, 3) relative, of each channel
     chart: np.ndarray  # (H, W, 2) px
     chart_angular: np.ndarray  # (P, 2) degrees
     chart_area: np.ndarray  # (P, 2)
@@ -151,7 +156,7 @@ def _collect(arrays: Mapping[str, Any]) -> Arrays:
     surface, irradiance, frontal = arrays["surface"], arrays["irradiance"], arrays["frontal"]
     data: Arrays = {"image/rgb": _rounded(arrays["image"]["rgb"]), "image/mask": arrays["image"]["mask"]}
     data |= {f"surface/{n}": surface[n] for n in ("height", "normals", "valid", "piece", "normal_sigma")}
-    data |= {f"irradiance/{n}": irradiance[n] for n in ("map", "sigma")}
+    data |= {f"irradiance/{n}": irradiance[n] for n in ("map", "sigma", "rgb") if n in irradiance}
     data |= {f"chart/{n}": arrays["chart"][n] for n in ("uv", "angular", "area")}
     for name in SCHEMA:
         group, _, short = name.partition("/")
@@ -241,6 +246,7 @@ def open_result(path: str | Path, max_bytes: int = 8 << 30) -> Result:
         mask=data["image/mask"],
         irradiance=data["irradiance/map"],
         irradiance_sigma=data["irradiance/sigma"],
+        irradiance_rgb=data.get("irradiance/rgb"),
         chart=data["chart/uv"],
         chart_angular=data["chart/angular"],
         chart_area=data["chart/area"],
@@ -265,6 +271,8 @@ def _check(path: Path, attributes: Mapping[str, Any], declared: Mapping[str, Dec
         )
     sizes: dict[str, int] = {}
     for name, entry in SCHEMA.items():
+        if name not in declared and entry.optional:
+            continue
         if name not in declared:
             raise InputError(f"{path}: {name} is missing; run sftex again to make the file anew")
         dtype, shape = declared[name]
