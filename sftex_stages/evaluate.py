@@ -209,6 +209,7 @@ def _instances(
         "textons": len(np.unique(found["texton"])),
         "off_surface": int((~there).sum()),
         **measures.compare_instances(found["normal"][there], found["sigma"][there], _nearest(normals, xy)),
+        **measures.split_errors(found["normal"][there], _nearest(normals, xy), texton),
     }
     out["recall"] = {"recall": None, "true": None, "found": None}
     if elements is not None:
@@ -308,6 +309,13 @@ def format_text(figures: dict[str, Any]) -> str:
         f"{_percent(instances['signs_right_best'])} with the better global flip",
         f"  |error| / sigma    {_calibration(instances['calibration'])}",
     ]
+    bins = [b for b in instances["by_slant"] if b["count"]]
+    lines.append("  error by slant     " + ", ".join(f"{b['from']}–{b['to']}° {b['median']:.1f}/{b['p90']:.1f}" for b in bins))
+    bias = instances["slant_bias"]
+    lines.append(
+        f"  slant              textons are off by {_number(bias['textons'], '.2f', '°')}, their instances scatter by "
+        f"{_number(bias['within'], '.2f', '°')} about that (medians)"
+    )
     if instances["irradiance"]:
         i = instances["irradiance"]
         lines.append(

@@ -5,6 +5,7 @@ its mirror image about the line of sight: the two are indistinguishable in one o
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 SHARES = (5.0, 11.25, 22.5, 30.0)  # degrees: the thresholds that the literature on normals reports
+SLANTS = (0, 15, 30, 45, 60, 90)  # degrees, bins of the true slant
 MISS = 90.0  # degrees: the error of a pixel that has a true normal and no estimate
 FLIP = np.array([-1.0, -1.0, 1.0])
 MIN_TEXTON = 5  # instances: fewer tell nothing about a texton's standard deviation
@@ -249,6 +251,27 @@ def compare_instances(normal: np.ndarray, sigma: np.ndarray, truth: np.ndarray) 
         "signs_right_best": None if right is None or turned is None else max(right, turned),
         "calibration": calibration(nearest, sigma),
     }
+
+
+def split_errors(normal: np.ndarray, truth: np.ndarray, texton: np.ndarray) -> dict[str, Any]:
+    """Where the error of instances comes from; normals (N, 3), their textons (N,).
+
+    `by_slant`: two-fold error in bins of the true slant. `slant_bias`, degrees: slant less true slant, its median over a
+    texton, is the texton's bias; `textons` is the median of their sizes, `within` that of the spread about them.
+    """
+    nearest = np.minimum(angle(normal, truth), angle(normal * FLIP, truth))
+    slant, true_slant = (np.degrees(np.arccos(np.clip(n[:, 2], -1, 1))) for n in (normal, truth))
+    bins = []
+    for low, high in pairwise(SLANTS):
+        here = nearest[(true_slant >= low) & (true_slant < high)]
+        median, p90 = (float(v) for v in np.percentile(here, (50, 90))) if len(here) else (None, None)
+        bins.append({"from": low, "to": high, "count": len(here), "median": median, "p90": p90})
+    groups = [(slant - true_slant)[texton == k] for k in np.unique(texton)]
+    groups = [g for g in groups if len(g) >= 4]
+    bias = [abs(float(np.median(g))) for g in groups]
+    within = [float(np.median(np.abs(g - np.median(g)))) / 0.6745 for g in groups]
+    common = {name: float(np.median(v)) if groups else None for name, v in (("textons", bias), ("within", within))}
+    return {"by_slant": bins, "slant_bias": common}
 
 
 def recall(found: np.ndarray, true_xy: np.ndarray, radius: np.ndarray) -> dict[str, Any]:

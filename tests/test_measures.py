@@ -194,3 +194,19 @@ def test_a_chart_under_perspective_is_free_in_size_only() -> None:
     chart = np.dstack([points @ u, points @ np.cross(normal, u)]) * 3
     got = measures.chart_distortion(chart, np.tile(normal, (60, 80, 1)), z, np.ones((60, 80), bool), focal, centre)
     assert got["angle"]["p95"] < 0.2 and got["area"]["p95"] < 0.01
+
+
+def test_errors_are_split_by_slant_and_into_what_a_texton_has_in_common():
+    """Texton 0 sees 3° too much slant, texton 1 is right up to ±1°; all without the two-fold ambiguity."""
+    slant = np.radians([10.0, 20, 33, 40] * 2)
+    extra = np.radians([3.0, 3, 3, 3, 1, -1, 1, -1])
+    texton = np.repeat([0, 1], 4)
+
+    def normals(s):
+        return np.stack([np.sin(s), np.zeros(8), np.cos(s)], 1)
+
+    got = measures.split_errors(normals(slant + extra) * measures.FLIP, normals(slant), texton)
+    assert [b["count"] for b in got["by_slant"]] == [2, 2, 4, 0, 0]
+    assert got["by_slant"][0]["median"] == pytest.approx(2.0) and got["by_slant"][3]["median"] is None
+    assert got["slant_bias"]["textons"] == pytest.approx(1.5)
+    assert got["slant_bias"]["within"] == pytest.approx(0.5 / 0.6745, rel=1e-3)
