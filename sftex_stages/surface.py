@@ -197,7 +197,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
         height = sizes.heights(camera, nodes.xy, nodes.w, change) if sizes else None
         start = start[cKDTree(before).query(nodes.xy)[1]]
     fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy, camera.stretch(nodes.xy))
-    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, height=height)
+    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, 3, height=height)
     instances, nodes, fine, solution = recalibrate(
         instances, nodes, fine, solution, camera, spacing, params, height
     )
@@ -231,7 +231,7 @@ def recalibrate(
     field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
     start, smooth = gaussian.gradients(field, solution.a), solution.smooth
     solution = refine.refine(
-        field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 2, height=height, noise=solution.noise
+        field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 1, height=height, noise=solution.noise
     )
     return instances, nodes, field, solution
 
@@ -442,4 +442,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=6, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=7, params=Params, run=run, inputs=("image", "frontal"))
