@@ -7,6 +7,7 @@ and the others were delivered, 4 every image failed, 130 interrupted. Results go
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import sys
 import time
@@ -28,6 +29,7 @@ OK, DEFECT, USAGE, SOME_FAILED, ALL_FAILED, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    gc.set_threshold(100_000, 50, 100)  # plans of thousands of images are millions of objects, and hardly a cycle
     args = _parser().parse_args(argv)
     try:
         code: int = args.command(args)
