@@ -1,5 +1,5 @@
 # make reconstruct IMAGES=photos/ [OUT=outputs] [CONFIG=pipeline.yaml] [MASKS=dir/] [JOBS=2]
-# make test | bench [SCENES='sphere*'] [BENCH_OUT=dir/] | faults (the long set; some 30 minutes) | clean | help
+# make test | bench [SCENES='sphere*'] [BENCH_OUT=dir/] | faults (the long set; some 45 minutes) | clean | help
 # The first target that needs it creates .venv with the locked versions; only Python 3.11 (or newer) and make are needed.
 
 IMAGES    ?= data/examples
