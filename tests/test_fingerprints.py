@@ -107,15 +107,31 @@ def others(value, annotation):
     if isinstance(value, float) or value is None:
         number = value or 1.0
         return [number * 1.01, number * 0.99, number + 0.01, 1, 0.5, 2]
+    if value == ():
+        return [((1.0, 2.0),), ((1.0, 2.0, 3.0),), (1.0,), ("x",)]
     if isinstance(value, tuple | list):
         return [value[:-1], (*value[:-1], value[-1] * 1.01), (*value, value[-1] + 1)]
-    if isinstance(value, StageParams):  # parameters within parameters
-        inner = [(n, v, f.annotation) for (n, v), f in zip(value, type(value).model_fields.values(), strict=True) if v != ()]
-        return [{**value.model_dump(), n: other} for n, v, annotation in inner for other in others(v, annotation)]
     return [value + "x"]
 
 
-FIELDS = [(s.name, field) for s in pipeline.PIPELINE for field in s.params.model_fields]
+def leaves(params, *above):
+    """(names that lead to it, value, annotation) of every parameter, those within parameters included."""
+    for name, field in type(params).model_fields.items():
+        value = getattr(params, name)
+        if isinstance(value, StageParams):
+            yield from leaves(value, *above, name)
+        else:
+            yield (*above, name), value, field.annotation
+
+
+def edited(params, names, value):
+    """The parameters with another value of one of them."""
+    first, *more = names
+    inner = edited(getattr(params, first), more, value) if more else value
+    return type(params).model_validate({**dict(params), first: inner})
+
+
+FIELDS = [(s.name, *leaf) for s in pipeline.PIPELINE for leaf in leaves(s.params())]
 
 
 @pytest.fixture(scope="module")
@@ -128,21 +144,23 @@ def before(tmp_path_factory):
     return store, item, all_keys(store, item, {stage.name: stage.params() for stage in pipeline.PIPELINE})
 
 
-@pytest.mark.parametrize("stage, field", FIELDS, ids=[f"{s}.{f}" for s, f in FIELDS])
-def test_a_parameter_changes_the_keys_of_its_stage_and_of_what_follows(before, stage, field, monkeypatch):
+@pytest.mark.parametrize("stage, names, default, annotation", FIELDS, ids=[".".join((f[0], *f[1])) for f in FIELDS])
+def test_a_parameter_changes_the_keys_of_its_stage_and_of_what_follows(
+    before, stage, names, default, annotation, monkeypatch
+):
     store, item, keys = before
     monkeypatch.setattr("os.fsync", lambda fd: None)
     params = {s.name: s.params() for s in pipeline.PIPELINE}
-    default = params[stage]
-    for value in others(getattr(default, field), type(default).model_fields[field].annotation):
+    for value in others(default, annotation):
         try:
-            params[stage] = type(default).model_validate({**default.model_dump(), field: value})
+            other = edited(params[stage], names, value)
         except ValidationError:
             continue
-        if params[stage] != default:
+        if other != params[stage]:
             break
     else:
-        pytest.fail(f"no other value of {stage}.{field} found to test with; teach `others` about it")
+        pytest.fail(f"no other value of {stage}.{'.'.join(names)} found to test with; teach `others` about it")
+    params[stage] = other
     now = all_keys(store, item, params)
     assert {name for name in keys if now[name] != keys[name]} == followers(stage)
     assert all_keys(store, item, {s.name: s.params() for s in pipeline.PIPELINE}) == keys
