@@ -252,7 +252,8 @@ def finish(
     sigma = normal_sigma(normal, left)
     centre = got.xy + transform @ information_centre(template)
     inlier = inlier * unique(got.xy, residual, transform, template)
-    light = channel_gains(template, sample(image, got.xy, got.frames, template.points), got.frames, got.slope)
+    seen = sample(image, got.xy, got.frames, template.points)
+    light = channel_gains(template, seen, got.frames, got.variation)
     good = inlier > 0.8
     metric_error = float(np.sqrt(np.linalg.eigvalsh(metric_cov[:3, :3])[-1]))
     least = max(float(np.median(residual[good])) if good.any() else 0.0, params.noise_floor**2 * contrast2)

@@ -10,7 +10,10 @@ transform T is T⁻¹ T⁻ᵀ wide, so that a steep instance is blurred more alo
 in that difference C the patch is µ + ½ C : ∇∇µ. Left out, small detail looks too wide where it is foreshortened, and
 slants come out too small.
 
-Light changes across an element that lies in a fold: its gain is L (1 + γ · s), and γ is solved for together with L.
+No two copies are quite alike beyond that. Light changes across an element that lies in a fold, and prints differ in tint:
+a copy shows L (µ (1 + γ · b) + τ), b(s) the first and second powers of position, which vanish at the centre, and τ one number
+a channel. This variation (γ, τ) is solved for together with L, each of its numbers held by a prior as wide as the texton's
+copies show it to vary (`learn_variation`): what does not vary costs no information.
 """
 
 from typing import NamedTuple
@@ -23,6 +26,9 @@ Array = NDArray[np.floating]
 
 _MOST_BLUR = 2.0  # texton units²: beyond it the first order says nothing
 _SPREAD_PRIOR, _SPREAD_DOUBT = 0.7, 0.25  # of the logarithm of the point spread: before looking, and at best
+_SHARED = 8  # neighbouring samples of one patch that share their noise
+_LEAST_TOLD, _LEAST_VARIATION = 0.02, 1e-3
+_MOTION, _BLUR, _VARIATION = slice(1, 7), slice(7, 10), slice(10, None)  # columns of the basis, after µ
 _ROWS = 30_000  # cv2.remap takes maps of fewer than 32768 rows
 
 
@@ -56,11 +62,13 @@ class Template(NamedTuple):
     points: Array  # (P, 2) texton units
     values: Array  # (P, C) µ
     weights: Array  # (P,) inverse-variance weights, 0 outside the domain
-    basis: Array  # (P·C, 12) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy), µ s / radius (x, y)]
-    gram: Array  # (12, 12) basisᵀ basis
+    basis: Array  # (P·C, B) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy), µ b (5), level of channel (C)]
+    gram: Array  # (B, B) basisᵀ basis
     radius: float  # of the grid, texton units
     spread: float  # variance of the image's point spread, px²
     mean_blur: Array  # (3,) mean of `blur` over the instances that µ is the mean of
+    level: float  # root mean square of µ, the unit of tints
+    ridge: Array  # (V,) prior precision of the variation (γ, τ), in the gram's units
 
 
 def blur(frames: Array) -> Array:
@@ -70,12 +78,25 @@ def blur(frames: Array) -> Array:
     return np.stack([(b * b + d * d) / area, -(a * b + c * d) / area, (a * a + c * c) / area], -1)
 
 
+def light_powers(points: Array, radius: float) -> Array:
+    """b (P, 5) = (x, y, x², 2 x y, y²) of `points` (P, 2) in units of `radius`: how light may change over an element."""
+    x, y = points[:, 0] / radius, points[:, 1] / radius
+    return np.stack([x, y, x * x, 2 * x * y, y * y], -1)
+
+
 def make_template(
-    values: Array, weights: Array, spacing: float, spread: float = 0.0, mean_blur: Array | None = None
+    values: Array,
+    weights: Array,
+    spacing: float,
+    spread: float = 0.0,
+    mean_blur: Array | None = None,
+    ridge: Array | None = None,
 ) -> Template:
     """Template from the texton's appearance `values` (n, n, C), pixel weights (n, n) and grid spacing.
 
     `spread` (px²) and `mean_blur` (3,) describe the blur that `values` contain; without them blur is taken to be common.
+    Without a `ridge` (V,) (`variation_ridge`) light may slope by a third of itself over the radius, and nothing else varies:
+    before an element is known, whatever may vary makes strangers alike.
     """
     n, channels = values.shape[0], values.shape[2]
     gy, gx = np.gradient(values, spacing, axis=(0, 1))
@@ -89,11 +110,17 @@ def make_template(
     xy = (padded[2:, 2:] - padded[2:, :-2] - padded[:-2, 2:] + padded[:-2, :-2]) / (4 * spacing**2)
     second = [a.reshape(-1, channels) for a in (xx, xy, yy)]
     radius = n // 2 * spacing
-    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy, *second, flat * sx / radius, flat * sy / radius]
     root = np.sqrt(weights.reshape(-1, 1))
+    level = float(np.sqrt(((root * flat) ** 2).sum() / max(channels * weights.sum(), 1e-30)))
+    light = [flat * b[:, None] for b in light_powers(points, radius).T]
+    tint = [np.broadcast_to(level * np.eye(channels)[c], flat.shape) for c in range(channels)]
+    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy, *second, *light, *tint]
     basis = np.stack([(c * root).ravel() for c in columns], -1).astype(np.float64)
+    gram = basis.T @ basis
+    if ridge is None:
+        ridge = gram[0, 0] * np.where(np.arange(len(gram) - _VARIATION.start) < 2, 1e-3, 1e6)
     mean_blur = np.zeros(3) if mean_blur is None else mean_blur
-    return Template(points, flat, weights.ravel(), basis, basis.T @ basis, radius, spread, mean_blur)
+    return Template(points, flat, weights.ravel(), basis, gram, radius, spread, mean_blur, level, ridge)
 
 
 def excess_blur(template: Template, frames: Array) -> Array:
@@ -108,7 +135,7 @@ class Solver(NamedTuple):
 
     used: NDArray[np.bool_]  # (P,), points with weight
     root: Array  # (P',) √w there
-    basis: Array  # (P'·C, 12) float32
+    basis: Array  # (P'·C, B) float32
     unit: Array  # (6,) radius for shifts, 1 for strains: one damping serves both
     values: Array  # (6,) eigenvalues of the Hessian with the gain marginalised
     vectors: Array  # (6, 6)
@@ -126,19 +153,40 @@ def make_solver(template: Template) -> Solver:
     return Solver(used, np.sqrt(weights).astype(np.float32), basis, unit, np.maximum(values, 0), vectors)
 
 
-_MOTION, _BLUR, _LIGHT = slice(1, 7), slice(7, 10), [0, 10, 11]  # columns of the basis
+def own_gram(template: Template) -> Array:
+    """(1 + V, 1 + V) normal matrix of what is a copy's own, gain and variation, with the variation's prior."""
+    own = _own(template)
+    return template.gram[np.ix_(own, own)] + np.diag(np.r_[0.0, template.ridge])
 
 
-def light_gram(template: Template) -> Array:
-    """(3, 3) normal matrix of the gain and its slope, the slope held by a weak prior (a third of the gain per radius)."""
-    return template.gram[np.ix_(_LIGHT, _LIGHT)] + 1e-3 * template.gram[0, 0] * np.diag([0.0, 1, 1])
+def _own(template: Template) -> Array:
+    return np.r_[0, _VARIATION.start : len(template.gram)]
 
 
 def marginal_hessian(template: Template) -> Array:
-    """(6, 6) Hessian of the registration in (a11, a12, a21, a22, t1, t2) with the light solved for (Schur complement)."""
+    """(6, 6) Hessian of the registration in (a11, a12, a21, a22, t1, t2), gain and variation solved for (Schur complement)."""
     gram = template.gram
-    cross = gram[_LIGHT, _MOTION]
-    return gram[_MOTION, _MOTION] - cross.T @ np.linalg.solve(light_gram(template), cross)
+    cross = gram[_own(template), _MOTION]
+    return gram[_MOTION, _MOTION] - cross.T @ np.linalg.solve(own_gram(template), cross)
+
+
+def variation_ridge(variance: Array, noise2: float, channels: int) -> Array:
+    """The `ridge` of a variation of that `variance` (V,) where residuals have variance `noise2`.
+
+    Neighbouring samples share their noise, eight to one, and so do channels.
+    """
+    return _SHARED * channels * noise2 / variance
+
+
+def learn_variation(template: Template, variation: Array, weights: Array, noise2: float, variance: Array) -> Array:
+    """The variance (V,) of the `variation` (M, V) of instances with `weights` (M,), found under a prior of `variance` (V,).
+
+    One step of MacKay's fixed point (Bayesian interpolation, Neural Computation 4, 1992): the mean square over the share that
+    the data, and not the prior, determine. What does not vary is gone after a few steps.
+    """
+    unsure = _SHARED * template.values.shape[1] * noise2 * np.diag(np.linalg.inv(own_gram(template)))[1:]
+    told = np.maximum(1 - unsure / variance, _LEAST_TOLD)
+    return np.clip(weights @ variation**2 / weights.sum() / told, _LEAST_VARIATION**2, 1.0)
 
 
 class Explained(NamedTuple):
@@ -146,28 +194,29 @@ class Explained(NamedTuple):
 
     left: Array  # (M, 6) projections of what is left of d / L on the derivatives
     gain: Array  # (M,) L
-    slope: Array  # (M, 2) γ, of the gain per texton unit
-    residual: Array  # (M,) mean of w |d / L − (1 + γ s) µ|² over Σ w
+    variation: Array  # (M, V) γ, τ
+    residual: Array  # (M,) mean of w |d / L − µ (1 + γ b) − τ|² over Σ w, the prior's share included
 
 
 def explain(template: Template, solver: Solver, patches: Array, excess: Array) -> Explained:
-    """Fit the light of patches (M, P', C) at the used points, with `excess` (M, 3) blur."""
+    """Fit gain and variation of patches (M, P', C) at the used points, with `excess` (M, 3) blur."""
     d = (patches * solver.root[None, :, None]).reshape(len(patches), -1)
     projected = (d @ solver.basis).astype(np.float64)
     gram = template.gram
-    blurred = gram[0] + excess @ gram[_BLUR]  # (M, 12) of the blurred template on all columns
-    normal = np.repeat(light_gram(template)[None], len(patches), 0)
+    blurred = gram[0] + excess @ gram[_BLUR]  # (M, B) of the blurred template on all columns
+    own = _own(template)
+    normal = np.repeat(own_gram(template)[None], len(patches), 0)
     normal[:, 0, 0] = blurred[:, 0] + np.einsum("mi,mi->m", excess, blurred[:, _BLUR])
-    normal[:, 0, 1:] = normal[:, 1:, 0] = blurred[:, 10:]
-    right = projected[:, _LIGHT]
+    normal[:, 0, 1:] = normal[:, 1:, 0] = blurred[:, _VARIATION]
+    right = projected[:, own]
     right[:, 0] += np.einsum("mi,mi->m", excess, projected[:, _BLUR])
-    light = np.linalg.solve(normal, right[..., None])[..., 0]
-    gain = np.maximum(light[:, 0], 1e-6)
-    energy = np.einsum("mp,mp->m", d, d, dtype=np.float64) - np.einsum("mi,mi->m", light, right)
-    left = projected[:, _MOTION] - gain[:, None] * blurred[:, _MOTION] - light[:, 1:] @ gram[10:, _MOTION]
-    slope = np.clip(light[:, 1:] / gain[:, None], -1, 1) / template.radius
+    found = np.linalg.solve(normal, right[..., None])[..., 0]
+    gain = np.maximum(found[:, 0], 1e-6)
+    energy = np.einsum("mp,mp->m", d, d, dtype=np.float64) - np.einsum("mi,mi->m", found, right)
+    left = projected[:, _MOTION] - gain[:, None] * blurred[:, _MOTION] - found[:, 1:] @ gram[_VARIATION, _MOTION]
+    variation = np.clip(found[:, 1:] / gain[:, None], -1, 1)
     mass = template.weights.sum() * template.values.shape[1]
-    return Explained(left / gain[:, None], gain, slope, np.maximum(energy / gain**2, 0) / mass)
+    return Explained(left / gain[:, None], gain, variation, np.maximum(energy / gain**2, 0) / mass)
 
 
 def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Array:
@@ -179,14 +228,28 @@ def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Arr
     return step * np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None] * solver.unit
 
 
-def channel_gains(template: Template, patches: Array, frames: Array, slope: Array) -> Array:
-    """(M, C) gain of each channel of patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2)."""
+def without_variation(template: Template, patches: Array, points: Array, gain: Array, variation: Array) -> Array:
+    """Patches (M, P, C), sampled at `points` (P, 2), of gain (M,), as they would be did nothing but the gain vary."""
+    channels = patches.shape[2]
+    light, tint = variation[:, :-channels], variation[:, -channels:]
+    even = patches - (template.level * gain[:, None] * tint).astype(np.float32)[:, None]
+    across = 1 + light.astype(np.float32) @ light_powers(points, template.radius).T.astype(np.float32)
+    return even / np.clip(across, 0.25, 4)[..., None]
+
+
+def channel_gains(template: Template, patches: Array, frames: Array, variation: Array) -> Array:
+    """(M, C) gain of each channel of patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2).
+
+    `variation` (M, V) is the one that registration found. Its light is taken out; its tint is not, because what looks like a
+    tint to all channels together is what light of another colour does to each.
+    """
     _, points, channels = patches.shape
+    light = np.concatenate([variation[:, :-channels], np.zeros((len(variation), channels))], 1)
+    even = without_variation(template, patches, template.points, np.ones(len(patches)), light)
     second = template.basis[:, _BLUR].reshape(points, channels, 3)
     root = np.sqrt(template.weights)[:, None]
     model = template.basis[:, 0].reshape(points, channels) + np.einsum("pck,mk->mpc", second, excess_blur(template, frames))
-    model *= (1 + slope @ template.points.T)[..., None]
-    seen = np.einsum("mpc,mpc->mc", patches * root, model)
+    seen = np.einsum("mpc,mpc->mc", even * root, model)
     return np.maximum(seen / np.maximum(np.einsum("mpc,mpc->mc", model, model), 1e-30), 1e-6)
 
 
@@ -242,8 +305,8 @@ class Registered(NamedTuple):
     xy: Array  # (M, 2)
     frames: Array  # (M, 2, 2)
     gain: Array  # (M,) L_i
-    slope: Array  # (M, 2) γ_i, per texton unit
-    residual: Array  # (M,) mean of w |d / L − (1 + γ s) µ|² over Σ w
+    variation: Array  # (M, V) γ_i, τ_i
+    residual: Array  # (M,) mean of w |d / L − µ (1 + γ b) − τ|² over Σ w, the prior's share included
 
 
 def register(
@@ -283,4 +346,4 @@ def register(
         active = active[np.abs(step / solver.unit).max(1) > 1e-3]
         if len(active) == 0:
             break
-    return Registered(xy, frames, got.gain, got.slope, got.residual)
+    return Registered(xy, frames, got.gain, got.variation, got.residual)

@@ -19,11 +19,14 @@ from .registration import (
     blur,
     compose_step,
     estimate_spread,
+    learn_variation,
     make_template,
     marginal_hessian,
     patch_grid,
     registration_step,
     sample,
+    variation_ridge,
+    without_variation,
 )
 
 Array = NDArray[np.floating]
@@ -89,16 +92,9 @@ def seed_members(patches: Array, window: Array) -> Array:
     return np.where(near >= max(cut, 0.5), np.clip(near, 0.0, 1.0) ** 4, 0.0)
 
 
-def weighted_mean(
-    patches: Array, gain: Array, weights: Array, slope: Array | None = None, points: Array | None = None
-) -> tuple[Array, Array]:
-    """Mean and variance over instances of the patches divided by their gain: (P, C), (P,).
-
-    `slope` (M, 2): the gain is gain (1 + slope · s) at the `points` s (P, 2).
-    """
+def weighted_mean(patches: Array, gain: Array, weights: Array) -> tuple[Array, Array]:
+    """Mean and variance over instances of the patches (M, P, C) divided by their gain: (P, C), (P,)."""
     share = weights / weights.sum()
-    if slope is not None and points is not None:
-        patches = patches / np.clip(1 + slope.astype(np.float32) @ points.T, 0.25, 4)[..., None]
     flat = patches.reshape(len(patches), -1)
     mean = ((share / gain).astype(np.float32) @ flat).reshape(patches.shape[1:])
     square = ((share / gain**2).astype(np.float32) @ np.square(flat)).reshape(patches.shape[1:])
@@ -170,13 +166,14 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
     history: list[tuple[int, Array, Array, Array]] = []
     scale = np.ones(len(xy))
     last_growth, spacing, spread = 0, 1.0, settings.spread
+    ridge: Array | None = None
     founders: NDArray[np.integer] = np.arange(len(xy))
     for iteration in range(1, settings.iterations + 1):
-        template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur)
+        template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur, ridge)
         contrast2 = weighted_contrast(template)
         # M-step for the transforms and gains, E-step for δ, all from the patches in hand
         step, light = registration_step(template, patches, frames, _DAMPING)
-        gain, slope, residual = light.gain, light.slope, light.residual
+        gain, variation, residual = light.gain, light.variation, light.residual
         if iteration == 1:
             noise2 = float(np.median(residual[inlier > 0.3]))
         samples = independent_samples(template)
@@ -193,10 +190,15 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             keep = inlier > 1e-3
             founders = founders[keep]
             xy, frames, inlier, gain = xy[keep], frames[keep], inlier[keep], gain[keep]
-            residual, step, slope = residual[keep], step[keep], slope[keep]
+            residual, step, variation = residual[keep], step[keep], variation[keep]
             where = where[keep]
             history = [(k, a[keep], b[keep], c[keep]) for k, a, b, c in history]
         if iteration >= settings.affine_iterations:
+            if ridge is None:
+                variance = np.full(variation.shape[1], _VARIES**2)
+            else:
+                variance = learn_variation(template, variation, inlier, noise2, variance)
+            ridge = variation_ridge(variance, noise2, values.shape[-1])
             since = iteration - settings.affine_iterations
             if since % _UPGRADE_EVERY == 0:
                 if settings.fit_spread and since > 0:
@@ -219,7 +221,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         patches = sample(image, xy, frames, points)
         gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
         shares = inlier * _sharpness(frames)
-        values, var = weighted_mean(patches, gain, shares, slope, points)
+        values, var = weighted_mean(without_variation(template, patches, points, gain, variation), gain, shares)
         mean_blur = shares @ blur(frames) / shares.sum()
         weights = domain_weights(values, var, half, 0.1, settings.agreement)
         if (weights > 0).sum() < 9:
@@ -229,13 +231,14 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
             break
     # EM that has settled would not change any more: its last state stands for the iterations that were not needed
     history += [(k, xy, frames, inlier) for k in PROGRESS if iteration < k <= settings.iterations]
-    template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur)
+    template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur, ridge)
     noise = float(np.sqrt(noise2))
     values = values.reshape(n, n, -1)
     return Estimate(template, values, weights, half, spacing, founders, xy, frames, inlier, noise, prior, history)
 
 
 _DAMPING = 1e-3
+_VARIES = 0.1  # standard deviation of an instance's light and tint, before looking
 _FREE_STRAIN = 1.0
 _UPGRADE_EVERY = 3  # iterations on the manifold between metric upgrades
 

@@ -7,9 +7,12 @@ from scipy.ndimage import map_coordinates
 from sftex_stages.geometry.imaging import compose
 from sftex_stages.geometry.registration import (
     blur,
+    channel_gains,
     compose_step,
     estimate_spread,
     explain,
+    learn_variation,
+    light_powers,
     make_solver,
     make_template,
     marginal_hessian,
@@ -17,6 +20,8 @@ from sftex_stages.geometry.registration import (
     register,
     registration_step,
     sample,
+    variation_ridge,
+    without_variation,
 )
 from sftex_stages.geometry.texton import centre_window
 
@@ -107,7 +112,7 @@ def test_basis_is_the_derivative_of_sampling(rng):
     template = make_template(values.reshape(n, n, 3), weights, spacing)
     inside = (weights.ravel() > 0) & (np.abs(points) < half * spacing).all(1)
     root = np.sqrt(weights.ravel())[:, None]
-    basis = template.basis.reshape(len(points), 3, 12)
+    basis = template.basis.reshape(len(points), 3, -1)
     assert np.abs(basis[..., 0] - root * values).max() < 1e-6
     # on this grid the template's differences span 2 × spacing: so does the difference of the sampling
     for k in range(6):
@@ -137,7 +142,7 @@ def test_basis_of_a_smooth_element_is_the_derivative_of_its_warp():
     points = patch_grid(half, spacing).astype(float)
     weights = centre_window(half)
     template = make_template(quadratic(points).reshape(n, n, 2), weights, spacing)
-    basis = template.basis.reshape(n * n, 2, 12)
+    basis = template.basis.reshape(n * n, 2, -1)
     inside = (weights.ravel() > 0) & (np.abs(points) < (half - 0.5) * spacing).all(1)
     for k in range(6):
         delta = np.zeros(6)
@@ -153,18 +158,22 @@ def test_basis_of_a_smooth_element_is_the_derivative_of_its_warp():
         assert np.abs(basis[inside, :, 7 + k] - (root * second[k])[inside]).max() < 1e-5
 
 
-def light_columns(template):
-    """Columns of gain and slope with the rows of the slope's prior below, (P·C + 2, 3)."""
-    prior = np.zeros((2, 3))
-    prior[:, 1:] = np.sqrt(1e-3 * template.gram[0, 0]) * np.eye(2)
-    return np.concatenate([template.basis[:, [0, 10, 11]], prior])
+def own_columns(template):
+    """Columns of gain and variation with the rows of the variation's prior below, (P·C + V, 1 + V)."""
+    prior = np.pad(np.diag(np.sqrt(template.ridge)), ((0, 0), (1, 0)))
+    return np.concatenate([template.basis[:, np.r_[0, 10 : template.basis.shape[1]]], prior])
 
 
-def test_marginal_hessian_is_what_is_left_when_the_light_is_solved_for(rng):
-    template = exact_template()
+def loose(template):
+    """The template with light and tint free to vary by tenths."""
+    return template._replace(ridge=np.full(len(template.ridge), 1e-3 * template.gram[0, 0]))
+
+
+def test_marginal_hessian_is_what_is_left_when_gain_and_variation_are_solved_for(rng):
+    template = loose(exact_template())
     x = rng.normal(size=6)
-    target = np.concatenate([template.basis[:, 1:7] @ x, np.zeros(2)])
-    design = light_columns(template)
+    target = np.concatenate([template.basis[:, 1:7] @ x, np.zeros(len(template.ridge))])
+    design = own_columns(template)
     left = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
     assert x @ marginal_hessian(template) @ x == pytest.approx(left @ left, rel=1e-9)
 
@@ -230,29 +239,65 @@ def test_reported_gain_and_residual_are_those_of_the_reported_frames(rng):
     patches = sample(image, got.xy, got.frames, template.points)
     found = explain(template, solver, patches[:, solver.used], np.zeros((m, 3)))
     assert got.gain == pytest.approx(found.gain) and got.residual == pytest.approx(found.residual)
-    assert got.slope == pytest.approx(found.slope)
-    design, root = light_columns(template), np.sqrt(template.weights)[:, None]
+    assert got.variation == pytest.approx(found.variation)
+    design, root = own_columns(template), np.sqrt(template.weights)[:, None]
     for k in range(m):
-        target = np.concatenate([(root * patches[k]).ravel(), np.zeros(2)])
+        target = np.concatenate([(root * patches[k]).ravel(), np.zeros(len(template.ridge))])
         best, left, _, _ = np.linalg.lstsq(design, target, rcond=None)
         assert found.gain[k] == pytest.approx(best[0], rel=1e-4)
-        assert found.slope[k] == pytest.approx(best[1:] / best[0] / template.radius, abs=1e-4)
+        assert found.variation[k] == pytest.approx(np.clip(best[1:] / best[0], -1, 1), abs=1e-4)
         direct = left[0] / best[0] ** 2 / (template.weights.sum() * 3)
         assert found.residual[k] == pytest.approx(direct, rel=1e-3, abs=1e-7)
 
 
-def test_light_that_changes_across_an_element_does_not_move_it(rng):
-    """A shadow's edge: the gain rises by up to a half of itself over the element's radius."""
+def varied(points, gain, light, tint, level):
+    """Patches (M, P, C) of the exact element whose light changes by `light` (M, 5), with `tint` (M, C)."""
+    across = 1 + light @ light_powers(points, np.abs(points).max()).T
+    return gain[:, None, None] * (texture(points)[None] * across[..., None] + level * tint[:, None, :])
+
+
+def test_light_and_tint_of_a_copy_do_not_move_it(rng):
+    """A shadow's edge, a fold's curved light, another ink: known at once, and no part of the motion."""
     m = 10
     template = exact_template()
-    points = template.points.astype(float)
-    slope = rng.uniform(-0.5, 0.5, (m, 2)) / template.radius
-    patches = np.repeat(texture(points)[None], m, 0) * (1 + slope @ points.T)[..., None]
-    step, light = registration_step(template, patches, np.repeat(np.eye(2)[None], m, 0), damping=0.0)
-    assert np.abs(step).max() < 5e-3
-    assert light.gain == pytest.approx(np.ones(m), abs=5e-3)
-    assert light.slope == pytest.approx(slope, rel=0.02, abs=1e-4)
-    assert light.residual.max() < 1e-3
+    template = template._replace(ridge=np.full(len(template.ridge), 1e-6 * template.gram[0, 0]))
+    points, still = template.points.astype(float), np.repeat(np.eye(2)[None], m, 0)
+    gain, light, tint = rng.uniform(0.5, 2, m), rng.uniform(-0.15, 0.15, (m, 5)), rng.uniform(-0.1, 0.1, (m, 3))
+    patches = varied(points, gain, light, tint, template.level)
+    step, found = registration_step(template, patches, still, damping=0.0)
+    assert np.abs(step).max() < 2e-4
+    assert found.gain == pytest.approx(gain, rel=1e-3)
+    assert found.variation == pytest.approx(np.concatenate([light, tint], 1), abs=2e-3)
+    assert found.residual.max() < 1e-6
+    assert without_variation(template, patches, points, gain, found.variation) == pytest.approx(
+        gain[:, None, None] * texture(points), rel=5e-3
+    )
+    coloured = gain[:, None] * np.array([1.2, 1.0, 0.7])
+    patches = varied(points, np.ones(m), light, 0 * tint, template.level) * coloured[:, None]
+    found = registration_step(loose(template), patches, still, damping=0.0)[1]
+    assert channel_gains(template, patches, still, np.pad(light, ((0, 0), (0, 3)))) == pytest.approx(coloured, rel=1e-3)
+    # left out of the model, the same light does move the element
+    stiff = template._replace(ridge=np.full(len(template.ridge), 1e6 * template.gram[0, 0]))
+    assert np.abs(registration_step(stiff, patches, still, damping=0.0)[0]).max() > 0.02
+
+
+def test_variation_is_learned_where_there_is_some_and_given_up_where_there_is_none(rng):
+    """Light that slopes along x and one channel's tint, in noise: their spread is found, all other numbers go to nothing."""
+    m, sigma = 200, 0.01
+    template = exact_template()
+    points, still = template.points.astype(float), np.repeat(np.eye(2)[None], m, 0)
+    spread = np.array([0.2, 0, 0, 0, 0, 0, 0.1, 0])
+    truth = spread * rng.normal(size=(m, 8))
+    patches = varied(points, np.ones(m), truth[:, :5], truth[:, 5:], template.level)
+    patches = patches + sigma * rng.normal(size=patches.shape)
+    noise2, channels = sigma**2 / 8 / 3, 3  # independent samples: what the ridge counts for shared noise is taken back
+    variance = np.full(8, 0.1**2)
+    for _ in range(12):
+        template = template._replace(ridge=variation_ridge(variance, noise2, channels))
+        found = registration_step(template, patches, still, damping=0.0)[1].variation
+        variance = learn_variation(template, found, np.ones(m), noise2, variance)
+    assert np.sqrt(variance[[0, 6]]) == pytest.approx(spread[[0, 6]], rel=0.15)
+    assert np.sqrt(variance[spread == 0]).max() < 0.01
 
 
 def test_compose_step_is_the_inverse_composition(rng):

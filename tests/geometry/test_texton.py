@@ -206,11 +206,10 @@ def test_circles_are_told_from_other_elements():
 def test_marginal_strain_is_what_remains_when_light_and_shift_are_solved_for(rng):
     template = template_of(glyph(grid(9)), 9)
     x = rng.normal(size=4)
-    # the slope of the light is held by a weak prior: two rows below the data
-    prior = np.zeros((2, 5))
-    prior[:, 3:] = np.sqrt(1e-3 * template.gram[0, 0]) * np.eye(2)
-    target = np.concatenate([template.basis[:, 1:5] @ x, np.zeros(2)])
-    nuisance = np.concatenate([template.basis[:, [0, 5, 6, 10, 11]], prior])
+    # light and tint are held by a prior: rows below the data
+    prior = np.pad(np.diag(np.sqrt(template.ridge)), ((0, 0), (3, 0)))
+    target = np.concatenate([template.basis[:, 1:5] @ x, np.zeros(len(template.ridge))])
+    nuisance = np.concatenate([template.basis[:, np.r_[0, 5, 6, 10 : template.basis.shape[1]]], prior])
     left = target - nuisance @ np.linalg.lstsq(nuisance, target, rcond=None)[0]
     assert x @ marginal_strain(template) @ x == pytest.approx(left @ left, rel=1e-6)
 
