@@ -28,7 +28,9 @@ _MOST_BLUR = 2.0  # texton units²: beyond it the first order says nothing
 _SPREAD_PRIOR, _SPREAD_DOUBT = 0.7, 0.25  # of the logarithm of the point spread: before looking, and at best
 _SHARED = 8  # neighbouring samples of one patch that share their noise
 _LEAST_TOLD, _LEAST_VARIATION = 0.02, 1e-3
-_MOTION, _BLUR, _VARIATION = slice(1, 7), slice(7, 10), slice(10, None)  # columns of the basis, after µ
+_POWERS = 5  # of position, that light may follow
+# columns, after µ: light comes first in the variation, tints follow
+_MOTION, _BLUR, _VARIATION, _LIGHT = slice(1, 7), slice(7, 10), slice(10, None), slice(10, 10 + _POWERS)
 _ROWS = 30_000  # cv2.remap takes maps of fewer than 32768 rows
 
 
@@ -39,20 +41,18 @@ def patch_grid(half: int, spacing: float) -> Array:
 
 
 def sample(image: Array, xy: Array, frames: Array, points: Array) -> Array:
-    """Bilinear samples of `image` (H, W, C) at xy_i + frames_i · points: (M, P, C) float32.
+    """Bilinear samples of `image` (H, W, C) float32 at xy_i + frames_i · points: (M, P, C) float32.
 
     `xy` (M, 2) and `frames` (M, 2, 2) are in pixels of `image`, pixel centres at integers; beyond the border the
     border's value is repeated.
     """
-    f, centre, points = frames.astype(np.float32), xy.astype(np.float32), points.astype(np.float32)
-    across, down = points[:, 0], points[:, 1]
+    warp = np.concatenate([frames, xy[..., None]], 2).astype(np.float32)
+    lifted = np.stack([points[:, 0], points[:, 1], np.ones(len(points))]).astype(np.float32)
     out = np.empty((len(xy), len(points), image.shape[2]), np.float32)
     for start in range(0, len(xy), _ROWS):
-        g, c = f[start : start + _ROWS, :, :, None], centre[start : start + _ROWS, :, None]
-        x = g[:, 0, 0] * across + g[:, 0, 1] * down + c[:, 0]
-        y = g[:, 1, 0] * across + g[:, 1, 1] * down + c[:, 1]
-        got = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[start : start + _ROWS] = got.reshape(len(x), len(points), -1)
+        part = slice(start, start + _ROWS)
+        x, y = warp[part, 0] @ lifted, warp[part, 1] @ lifted
+        cv2.remap(image, x, y, cv2.INTER_LINEAR, dst=out[part], borderMode=cv2.BORDER_REPLICATE)
     return out
 
 
@@ -62,13 +62,18 @@ class Template(NamedTuple):
     points: Array  # (P, 2) texton units
     values: Array  # (P, C) µ
     weights: Array  # (P,) inverse-variance weights, 0 outside the domain
-    basis: Array  # (P·C, B) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy), µ b (5), level of channel (C)]
-    gram: Array  # (B, B) basisᵀ basis
+    columns: Array  # (B, P, C) √w [µ, ∂µ/∂A (a11, a12, a21, a22), ∂µ/∂t, ½ ∂²µ (xx, xy + yx, yy), µ b (5), level (C)]
+    gram: Array  # (B, B) of the columns' products
     radius: float  # of the grid, texton units
     spread: float  # variance of the image's point spread, px²
     mean_blur: Array  # (3,) mean of `blur` over the instances that µ is the mean of
     level: float  # root mean square of µ, the unit of tints
     ridge: Array  # (V,) prior precision of the variation (γ, τ), in the gram's units
+
+    @property
+    def basis(self) -> Array:
+        """(P·C, B): the columns."""
+        return self.columns.reshape(len(self.columns), -1).T
 
 
 def blur(frames: Array) -> Array:
@@ -79,9 +84,9 @@ def blur(frames: Array) -> Array:
 
 
 def light_powers(points: Array, radius: float) -> Array:
-    """b (P, 5) = (x, y, x², 2 x y, y²) of `points` (P, 2) in units of `radius`: how light may change over an element."""
-    x, y = points[:, 0] / radius, points[:, 1] / radius
-    return np.stack([x, y, x * x, 2 * x * y, y * y], -1)
+    """b (5, P) = (x, y, x², 2 x y, y²) of `points` (P, 2) in units of `radius`: how light may change over an element."""
+    x, y = points.T / radius
+    return np.stack([x, y, x * x, 2 * x * y, y * y])
 
 
 def make_template(
@@ -99,28 +104,37 @@ def make_template(
     before an element is known, whatever may vary makes strangers alike.
     """
     n, channels = values.shape[0], values.shape[2]
-    gy, gx = np.gradient(values, spacing, axis=(0, 1))
     points = patch_grid(n // 2, spacing)
-    sx, sy = points[:, :1], points[:, 1:]
-    gx, gy = gx.reshape(-1, channels), gy.reshape(-1, channels)
-    flat = values.reshape(-1, channels)
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    xx = (padded[1:-1, 2:] - 2 * values + padded[1:-1, :-2]) / (2 * spacing**2)
-    yy = (padded[2:, 1:-1] - 2 * values + padded[:-2, 1:-1]) / (2 * spacing**2)
-    xy = (padded[2:, 2:] - padded[2:, :-2] - padded[:-2, 2:] + padded[:-2, :-2]) / (4 * spacing**2)
-    second = [a.reshape(-1, channels) for a in (xx, xy, yy)]
     radius = n // 2 * spacing
-    root = np.sqrt(weights.reshape(-1, 1))
-    level = float(np.sqrt(((root * flat) ** 2).sum() / max(channels * weights.sum(), 1e-30)))
-    light = [flat * b[:, None] for b in light_powers(points, radius).T]
-    tint = [np.broadcast_to(level * np.eye(channels)[c], flat.shape) for c in range(channels)]
-    columns = [flat, gx * sx, gx * sy, gy * sx, gy * sy, gx, gy, *second, *light, *tint]
-    basis = np.stack([(c * root).ravel() for c in columns], -1).astype(np.float64)
-    gram = basis.T @ basis
+    sx, sy = points.T.reshape(2, n, n, 1)
+    # one more row and column on all sides, in a straight line: central differences are then one-sided at the border
+    v = np.empty((n + 2, n + 2, channels))
+    v[1:-1, 1:-1] = values
+    v[0], v[-1] = 2 * v[1] - v[2], 2 * v[-2] - v[-3]
+    v[:, 0], v[:, -1] = 2 * v[:, 1] - v[:, 2], 2 * v[:, -2] - v[:, -3]
+    level = float(np.sqrt((weights[..., None] * values**2).sum() / max(channels * weights.sum(), 1e-30)))
+    columns = np.zeros((_VARIATION.start + _POWERS + channels, n, n, channels))
+    gx, gy = columns[5], columns[6]
+    gx[:] = (v[1:-1, 2:] - v[1:-1, :-2]) / (2 * spacing)
+    gy[:] = (v[2:, 1:-1] - v[:-2, 1:-1]) / (2 * spacing)
+    columns[0] = values
+    columns[1], columns[2], columns[3], columns[4] = gx * sx, gx * sy, gy * sx, gy * sy
+    columns[7] = (v[1:-1, 2:] - 2 * values + v[1:-1, :-2]) / (2 * spacing**2)
+    columns[8] = (v[2:, 2:] - v[2:, :-2] - v[:-2, 2:] + v[:-2, :-2]) / (4 * spacing**2)
+    columns[9] = (v[2:, 1:-1] - 2 * values + v[:-2, 1:-1]) / (2 * spacing**2)
+    columns[_LIGHT] = values * light_powers(points, radius).reshape(_POWERS, n, n, 1)
+    for c in range(channels):
+        columns[_LIGHT.stop + c, ..., c] = level
+    columns *= np.sqrt(weights)[..., None]
+    size = len(columns)
+    gram = columns.reshape(size, -1) @ columns.reshape(size, -1).T
     if ridge is None:
-        ridge = gram[0, 0] * np.where(np.arange(len(gram) - _VARIATION.start) < 2, 1e-3, 1e6)
+        ridge = gram[0, 0] * np.where(np.arange(size - _VARIATION.start) < 2, 1e-3, 1e6)
     mean_blur = np.zeros(3) if mean_blur is None else mean_blur
-    return Template(points, flat, weights.ravel(), basis, gram, radius, spread, mean_blur, level, ridge)
+    flat = columns.reshape(size, n * n, channels)
+    return Template(
+        points, values.reshape(-1, channels), weights.ravel(), flat, gram, radius, spread, mean_blur, level, ridge
+    )
 
 
 def excess_blur(template: Template, frames: Array) -> Array:
@@ -133,24 +147,25 @@ def excess_blur(template: Template, frames: Array) -> Array:
 class Solver(NamedTuple):
     """The part of a registration step that depends on the template alone."""
 
-    used: NDArray[np.bool_]  # (P,), points with weight
-    root: Array  # (P',) √w there
-    basis: Array  # (P'·C, B) float32
+    used: NDArray[np.bool_]  # (P,), points that patches are asked at; P' of them
+    weights: Array  # (P'·C,) w there
+    basis: Array  # (P'·C, B) float32, √w × that of the template
     unit: Array  # (6,) radius for shifts, 1 for strains: one damping serves both
     values: Array  # (6,) eigenvalues of the Hessian with the gain marginalised
     vectors: Array  # (6, 6)
 
 
-def make_solver(template: Template) -> Solver:
-    """Prepare registration steps to `template`."""
-    used = template.weights > 0
+def make_solver(template: Template, everywhere: bool = False) -> Solver:
+    """Prepare registration steps to `template`, from patches at the points with weight or at all of its points."""
+    used = (template.weights > 0) | everywhere
+    channels = template.values.shape[1]
     weights, points = template.weights[used], template.points[used]
-    radius = float(np.sqrt((weights[:, None] * points**2).sum() / weights.sum())) + 1e-9
+    radius = float(np.sqrt((weights @ points**2).sum() / weights.sum())) + 1e-9
     unit = np.array([1.0, 1, 1, 1, radius, radius])
-    hessian = marginal_hessian(template) * np.outer(unit, unit)
-    values, vectors = np.linalg.eigh(hessian)
-    basis = template.basis[np.repeat(used, template.values.shape[1])].astype(np.float32)
-    return Solver(used, np.sqrt(weights).astype(np.float32), basis, unit, np.maximum(values, 0), vectors)
+    values, vectors = np.linalg.eigh(marginal_hessian(template) * np.outer(unit, unit))
+    columns = template.columns if everywhere else template.columns[:, used]
+    basis = (columns * np.sqrt(weights)[:, None]).astype(np.float32).reshape(len(columns), -1).T
+    return Solver(used, np.repeat(weights.astype(np.float32), channels), basis, unit, np.maximum(values, 0), vectors)
 
 
 def own_gram(template: Template) -> Array:
@@ -200,7 +215,7 @@ class Explained(NamedTuple):
 
 def explain(template: Template, solver: Solver, patches: Array, excess: Array) -> Explained:
     """Fit gain and variation of patches (M, P', C) at the used points, with `excess` (M, 3) blur."""
-    d = (patches * solver.root[None, :, None]).reshape(len(patches), -1)
+    d = patches.reshape(len(patches), -1)
     projected = (d @ solver.basis).astype(np.float64)
     gram = template.gram
     blurred = gram[0] + excess @ gram[_BLUR]  # (M, B) of the blurred template on all columns
@@ -212,7 +227,7 @@ def explain(template: Template, solver: Solver, patches: Array, excess: Array) -
     right[:, 0] += np.einsum("mi,mi->m", excess, projected[:, _BLUR])
     found = np.linalg.solve(normal, right[..., None])[..., 0]
     gain = np.maximum(found[:, 0], 1e-6)
-    energy = np.einsum("mp,mp->m", d, d, dtype=np.float64) - np.einsum("mi,mi->m", found, right)
+    energy = np.square(d) @ solver.weights - np.einsum("mi,mi->m", found, right)
     left = projected[:, _MOTION] - gain[:, None] * blurred[:, _MOTION] - found[:, 1:] @ gram[_VARIATION, _MOTION]
     variation = np.clip(found[:, 1:] / gain[:, None], -1, 1)
     mass = template.weights.sum() * template.values.shape[1]
@@ -223,34 +238,31 @@ def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Arr
     """Damped Gauss–Newton steps (M, 6) (strain, shift) from what `explain` left; steps beyond `limit` (strain, or shift in
     radii) are shortened."""
     right = left * solver.unit
-    step = ((right @ solver.vectors) / (solver.values + damping[:, None] * solver.values[-1])) @ solver.vectors.T
+    stiff = np.maximum(solver.values + damping[:, None] * solver.values[-1], 1e-30)  # a plain template holds nothing
+    step = ((right @ solver.vectors) / stiff) @ solver.vectors.T
     size = np.abs(step).max(1)
     return step * np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None] * solver.unit
-
-
-def without_variation(template: Template, patches: Array, points: Array, gain: Array, variation: Array) -> Array:
-    """Patches (M, P, C), sampled at `points` (P, 2), of gain (M,), as they would be did nothing but the gain vary."""
-    channels = patches.shape[2]
-    light, tint = variation[:, :-channels], variation[:, -channels:]
-    even = patches - (template.level * gain[:, None] * tint).astype(np.float32)[:, None]
-    across = 1 + light.astype(np.float32) @ light_powers(points, template.radius).T.astype(np.float32)
-    return even / np.clip(across, 0.25, 4)[..., None]
 
 
 def channel_gains(template: Template, patches: Array, frames: Array, variation: Array) -> Array:
     """(M, C) gain of each channel of patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2).
 
-    `variation` (M, V) is the one that registration found. Its light is taken out; its tint is not, because what looks like a
-    tint to all channels together is what light of another colour does to each.
+    By least squares on the model (µ + ½ C : ∇∇µ) (1 + γ · b), which is a sum of 24 products of one part each.
+    `variation` (M, V) is the one that registration found. Its light is taken out; its tint is not, because what looks like
+    a tint to all channels together is what light of another colour does to each.
     """
-    _, points, channels = patches.shape
-    light = np.concatenate([variation[:, :-channels], np.zeros((len(variation), channels))], 1)
-    even = without_variation(template, patches, template.points, np.ones(len(patches)), light)
-    second = template.basis[:, _BLUR].reshape(points, channels, 3)
-    root = np.sqrt(template.weights)[:, None]
-    model = template.basis[:, 0].reshape(points, channels) + np.einsum("pck,mk->mpc", second, excess_blur(template, frames))
-    seen = np.einsum("mpc,mpc->mc", even * root, model)
-    return np.maximum(seen / np.maximum(np.einsum("mpc,mpc->mc", model, model), 1e-30), 1e-6)
+    powers = np.concatenate([np.ones((1, len(template.points))), light_powers(template.points, template.radius)])
+    parts = template.columns[[0, *range(_BLUR.start, _BLUR.stop)], None] * powers[None, :, :, None]  # (4, 6, P, C)
+    blurred = np.concatenate([np.ones((len(frames), 1)), excess_blur(template, frames)], 1)
+    lit = np.concatenate([np.ones((len(frames), 1)), variation[:, :_POWERS]], 1)
+    share = (blurred[:, :, None] * lit[:, None, :]).reshape(len(frames), -1)
+    root = np.sqrt(template.weights)
+    gains = np.empty((len(patches), patches.shape[2]))
+    for c, seen in enumerate(np.moveaxis(patches, 2, 0)):
+        part = parts[..., c].reshape(share.shape[1], -1)
+        along = seen @ (root * part).astype(np.float32).T
+        gains[:, c] = (share * along).sum(1) / np.maximum((share @ (part @ part.T) * share).sum(1), 1e-30)
+    return np.maximum(gains, 1e-6)
 
 
 def estimate_spread(template: Template, patches: Array, frames: Array, weights: Array, noise2: float, prior: float) -> float:
@@ -259,10 +271,7 @@ def estimate_spread(template: Template, patches: Array, frames: Array, weights: 
     One number for all instances: the part of the residual along ½ C : ∇∇µ that neither the gain nor an affine step takes
     up. In logarithms, against `prior` (known to a factor of two); `noise2` is the residuals' variance.
     """
-    plain = template._replace(spread=0.0)
-    solver = make_solver(plain)
-    d = (patches[:, solver.used] * solver.root[None, :, None]).reshape(len(patches), -1)
-    projected = (d @ solver.basis).astype(np.float64)
+    projected = (patches.reshape(len(patches), -1) @ make_solver(template, everywhere=True).basis).astype(np.float64)
     gram = template.gram
     other = [k for k in range(len(gram)) if not _BLUR.start <= k < _BLUR.stop]
     left = projected / np.maximum(projected[:, :1] / gram[0, 0], 1e-6) - gram[0]
@@ -286,8 +295,8 @@ def registration_step(
     template: Template, patches: Array, frames: Array, damping: float, limit: float = 0.35
 ) -> tuple[Array, Explained]:
     """One step (M, 6) for patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2), and their light."""
-    solver = make_solver(template)
-    got = explain(template, solver, patches[:, solver.used], excess_blur(template, frames))
+    solver = make_solver(template, everywhere=True)
+    got = explain(template, solver, patches, excess_blur(template, frames))
     return solve_step(solver, got.left, np.full(len(patches), damping), limit), got
 
 

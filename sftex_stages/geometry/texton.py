@@ -20,13 +20,13 @@ from .registration import (
     compose_step,
     estimate_spread,
     learn_variation,
+    light_powers,
     make_template,
     marginal_hessian,
     patch_grid,
     registration_step,
     sample,
     variation_ridge,
-    without_variation,
 )
 
 Array = NDArray[np.floating]
@@ -81,25 +81,45 @@ def seed_members(patches: Array, window: Array) -> Array:
     Similarity is zero-mean normalised correlation over the window; the seed is the patch that has the most good
     neighbours, and the members near it found the first template: a cluster that mixes elements starts from one.
     """
-    w = window.ravel()[None, :, None]
+    w = window.astype(np.float32).ravel()[None, :, None]
     mean = (patches * w).sum(1, keepdims=True) / w.sum()
-    flat = ((patches - mean) * np.sqrt(w)).reshape(len(patches), -1)
-    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
-    similar = flat @ flat.T
+    detail = ((patches - mean) * np.sqrt(w)).reshape(len(patches), -1)
+    detail /= np.maximum(np.linalg.norm(detail, axis=1, keepdims=True), 1e-9)
+    similar = detail @ detail.T
     score = np.sort(similar, axis=1)[:, -max(3, len(patches) // 3) :].mean(1)
     near = similar[int(score.argmax())]
     cut = np.sort(near)[-max(3, int(0.6 * len(near)))]
     return np.where(near >= max(cut, 0.5), np.clip(near, 0.0, 1.0) ** 4, 0.0)
 
 
-def weighted_mean(patches: Array, gain: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean and variance over instances of the patches (M, P, C) divided by their gain: (P, C), (P,)."""
+def weighted_mean(
+    patches: Array,
+    gain: Array,
+    weights: Array,
+    light: Array | None = None,
+    powers: Array | None = None,
+    tint: Array | None = None,
+) -> tuple[Array, Array]:
+    """µ (P, C) of patches (M, P, C) = L_i (µ (1 + γ_i · b) + τ_i), and the variance (P,) of the residuals of d / L.
+
+    `gain` (M,) is L, `light` (M, 5) γ with `powers` (5, P) b, `tint` (M, C) τ; without them nothing but the gain varies. By
+    least squares, so that a sample counts by the square of its light; sums over instances are products, no patch is copied.
+    """
     share = weights / weights.sum()
-    flat = patches.reshape(len(patches), -1)
-    mean = ((share / gain).astype(np.float32) @ flat).reshape(patches.shape[1:])
-    square = ((share / gain**2).astype(np.float32) @ np.square(flat)).reshape(patches.shape[1:])
+    d, shape = patches.reshape(len(patches), -1), patches.shape[1:]
+    lit, b = np.ones((len(share), 1)), np.ones((1, shape[0]))
+    if light is not None and powers is not None:
+        lit, b = np.concatenate([lit, light], 1), np.concatenate([b, powers])
+    seen = (((share / gain)[:, None] * lit).T.astype(np.float32) @ d).reshape(len(b), *shape)
+    square = ((share / gain**2).astype(np.float32) @ np.square(d)).reshape(shape)
+    if tint is not None:
+        seen = seen - ((share[:, None] * lit).T @ tint)[:, None]
+        for c in range(shape[1]):
+            square[:, c] += share @ tint[:, c] ** 2 - 2 * ((share / gain * tint[:, c]).astype(np.float32) @ patches[:, :, c])
+    light2 = (((share[:, None] * lit).T @ lit @ b) * b).sum(0)[:, None]  # Σ share (1 + γ · b)²
+    mean = (seen * b[..., None]).sum(0) / light2
     effective = 1 / (share**2).sum()
-    var = np.maximum(square - mean**2, 0).mean(1) * effective / max(effective - 1, 0.5)
+    var = np.maximum(square - light2 * mean**2, 0).mean(1) * effective / max(effective - 1, 0.5)
     return mean.astype(np.float64), var.astype(np.float64)
 
 
@@ -127,8 +147,10 @@ def domain_weights(values: Array, var: Array, half: int, floor: float, agreement
     mask = agree.reshape(n, n).astype(np.uint8)
     _, labels = cv2.connectedComponents(mask, connectivity=4)
     core = slice(half - max(1, half // 4), half + max(1, half // 4) + 1)
-    touching = np.unique(labels[core, core])
-    keep = np.isin(labels, touching[touching > 0]).ravel()
+    touching = np.zeros(labels.max() + 1, bool)
+    touching[labels[core, core]] = True
+    touching[0] = False
+    keep = touching[labels].ravel()
     weights = np.where(keep, base / (base + image), 0.0)
     return weights.reshape(n, n)
 
@@ -140,8 +162,8 @@ def grow(values: Array, var: Array, half: int, agreement: float, contrast2: floa
     r = np.sqrt(axis[:, None] ** 2 + axis[None, :] ** 2).ravel()
     ring = (r <= 1) & (r > 0.75)
     # a flat ring agrees always and tells nothing: it must carry some of the contrast
-    flat = values.reshape(n * n, -1)
-    busy = ((flat[ring] - flat[ring].mean(0)) ** 2).mean() > 0.02 * contrast2
+    rim = values.reshape(n * n, -1)[ring]
+    busy = ((rim - rim.mean(0)) ** 2).mean() > 0.02 * contrast2
     return bool((var[ring] < agreement * contrast2).mean() > 0.25 and busy)
 
 
@@ -172,10 +194,10 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         template = make_template(values.reshape(n, n, -1), weights, spacing, spread, mean_blur, ridge)
         contrast2 = weighted_contrast(template)
         # M-step for the transforms and gains, E-step for δ, all from the patches in hand
-        step, light = registration_step(template, patches, frames, _DAMPING)
-        gain, variation, residual = light.gain, light.variation, light.residual
+        step, own = registration_step(template, patches, frames, _DAMPING)
+        gain, variation, residual = own.gain, own.variation, own.residual
         if iteration == 1:
-            noise2 = float(np.median(residual[inlier > 0.3]))
+            noise2 = max(float(np.median(residual[inlier > 0.3])), 1e-12)
         samples = independent_samples(template)
         for _ in range(3):
             inlier = posterior(residual, noise2, contrast2, prior, samples)
@@ -221,7 +243,9 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         patches = sample(image, xy, frames, points)
         gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
         shares = inlier * _sharpness(frames)
-        values, var = weighted_mean(without_variation(template, patches, points, gain, variation), gain, shares)
+        light, tint = np.split(variation, [len(variation[0]) - values.shape[-1]], 1)
+        powers = light_powers(points, template.radius)
+        values, var = weighted_mean(patches, gain, shares, light, powers, template.level * tint)
         mean_blur = shares @ blur(frames) / shares.sum()
         weights = domain_weights(values, var, half, 0.1, settings.agreement)
         if (weights > 0).sum() < 9:
@@ -280,7 +304,7 @@ def marginal_strain(template: Template) -> Array:
 
 def information_centre(template: Template) -> Array:
     """Centre (2,) of the detail that fixes the transform: mean position weighted by w |∇µ|²."""
-    power = (template.basis[:, 5:7] ** 2).sum(1).reshape(len(template.points), -1).sum(1)
+    power = (template.columns[5:7] ** 2).sum((0, 2))
     return power @ template.points / max(power.sum(), 1e-30)
 
 

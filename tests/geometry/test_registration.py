@@ -21,7 +21,6 @@ from sftex_stages.geometry.registration import (
     registration_step,
     sample,
     variation_ridge,
-    without_variation,
 )
 from sftex_stages.geometry.texton import centre_window
 
@@ -252,7 +251,7 @@ def test_reported_gain_and_residual_are_those_of_the_reported_frames(rng):
 
 def varied(points, gain, light, tint, level):
     """Patches (M, P, C) of the exact element whose light changes by `light` (M, 5), with `tint` (M, C)."""
-    across = 1 + light @ light_powers(points, np.abs(points).max()).T
+    across = 1 + light @ light_powers(points, np.abs(points).max())
     return gain[:, None, None] * (texture(points)[None] * across[..., None] + level * tint[:, None, :])
 
 
@@ -269,9 +268,6 @@ def test_light_and_tint_of_a_copy_do_not_move_it(rng):
     assert found.gain == pytest.approx(gain, rel=1e-3)
     assert found.variation == pytest.approx(np.concatenate([light, tint], 1), abs=2e-3)
     assert found.residual.max() < 1e-6
-    assert without_variation(template, patches, points, gain, found.variation) == pytest.approx(
-        gain[:, None, None] * texture(points), rel=5e-3
-    )
     coloured = gain[:, None] * np.array([1.2, 1.0, 0.7])
     patches = varied(points, np.ones(m), light, 0 * tint, template.level) * coloured[:, None]
     found = registration_step(loose(template), patches, still, damping=0.0)[1]
