@@ -290,14 +290,16 @@ def project_tensors(tensor: Array, cov: Array, steps: int = 4) -> tuple[Array, A
     covariance left on the constraint, and chi² (N,) with one degree of freedom, of the distance: a patch that is no
     view of the texton shows there.
     """
-    out = tensor.copy()
+    out = tensor
+    grad = np.empty_like(tensor)
     for _ in range(steps):
-        mat = np.stack([out[:, 0], out[:, 1], out[:, 1], out[:, 2]], -1).reshape(-1, 2, 2)
-        _, _, u = leading_eigenpair(mat)
-        grad = np.stack([u[:, 0] ** 2, 2 * u[:, 0] * u[:, 1], u[:, 1] ** 2], -1)
+        half, cross = (out[:, 0] - out[:, 2]) / 2, out[:, 1]
+        radius = np.maximum(np.hypot(half, cross), 1e-30)
+        cos, sin = half / radius, cross / radius  # of twice the leading direction's angle
+        grad[:, 0], grad[:, 1], grad[:, 2] = (1 + cos) / 2, sin, (1 - cos) / 2
         # the constraint linearised at `out`: λ1(out) + grad·(new − out) = 1, and λ1(out) = grad·out
         gap = (grad * tensor).sum(1) - 1.0
-        lever = np.einsum("nij,nj->ni", cov, grad)
+        lever = (cov @ grad[..., None])[..., 0]
         spread = np.maximum((grad * lever).sum(1), 1e-12)
         out = tensor - lever * (gap / spread)[:, None]
     left = cov - lever[:, :, None] * lever[:, None, :] / spread[:, None, None]
