@@ -68,6 +68,7 @@ class Params(StageParams):
 _ENOUGH = 20  # instances that chance does not bring together, however large their cluster
 _CIRCLE_SLACK = 4.0  # one size is all that a circle's upgrade fits, so that scattered sizes say less against it
 _MEMO: dict[Any, Any] = {}  # the pyramid of the image in hand, shared by the jobs that one worker runs
+_SIZES: dict[str, Any] = {}  # the same of the descriptors: squared lengths, and log sizes of their frames
 
 
 def sampling_spread(factor: float) -> float:
@@ -187,10 +188,13 @@ def adopt(detect: Mapping[str, Any], members: Indices, found: Indices, reach: fl
     if reach == 0 or len(found) < 4:
         return np.zeros(0, members.dtype)
     descriptor, kind = detect["descriptor"], detect["kind"]
-    size = np.log(np.abs(np.linalg.det(detect["frame"].astype(np.float64)))) / 2
+    if _SIZES.get("of") is not descriptor:
+        size = np.log(np.abs(np.linalg.det(detect["frame"].astype(np.float64)))) / 2
+        _SIZES.update({"of": descriptor, "size": size, "length": np.einsum("nk,nk->n", descriptor, descriptor)})
+    size = _SIZES["size"]
     own = members[found]
     centre = descriptor[own].mean(0)
-    distance = np.einsum("nk,nk->n", descriptor, descriptor) - 2 * descriptor @ centre  # squared, but for a constant
+    distance = _SIZES["length"] - 2 * descriptor @ centre  # squared, but for a constant
     near = (distance < np.quantile(distance[own], reach)) & (kind == kind[members[0]])
     near &= np.abs(size - np.median(size[own])) < np.log(2.0)
     near[members] = False
@@ -340,13 +344,17 @@ def unique(xy: Array, residual: Array, transform: Array, template: Any) -> Array
 def progress(image: Array, texton: Estimate) -> Array:
     """The frontal appearance after each iteration in the history, on the final grid and gauge: (k, n, n, 3)."""
     n = 2 * texton.half + 1
-    pictures = []
-    for _, xy, frames, inlier in texton.history:
+    points = patch_grid(texton.half, texton.spacing)
+    pictures: list[Array] = []
+    for k, (_, xy, frames, inlier) in enumerate(texton.history):
+        if k and frames is texton.history[k - 1][2]:  # EM had settled
+            pictures.append(pictures[-1])
+            continue
         # the gauge of that iteration against the final one: a common map, by least squares over the founders
         weight = texton.inlier[:, None, None]
         a = np.einsum("mji,mjk->ik", frames * weight, frames)
         b = np.einsum("mji,mjk->ik", frames * weight, texton.frames)
-        patches = sample(image, xy, frames @ np.linalg.solve(a, b), patch_grid(texton.half, texton.spacing))
+        patches = sample(image, xy, frames @ np.linalg.solve(a, b), points)
         gain = np.maximum(patches.mean((1, 2)), 1e-6)
         mean, _ = weighted_mean(patches, gain / np.median(gain), inlier + 1e-9)
         pictures.append(mean.reshape(n, n, -1))
