@@ -330,13 +330,12 @@ def unique(xy: Array, residual: Array, transform: Array, template: Any) -> Array
     used = template.weights > 0.3 * template.weights.max()
     radius = np.sqrt(used.sum() / np.pi)
     size = np.sqrt(np.abs(np.linalg.det(transform))) * radius
-    taken: list[int] = []
+    taken, count = np.empty_like(xy), 0
     for i in order:
-        if taken:
-            d = np.linalg.norm(xy[taken] - xy[i], axis=1)
-            if (d < 0.25 * size[i]).any():
-                continue
-        taken.append(int(i))
+        apart2 = ((taken[:count] - xy[i]) ** 2).sum(1)
+        if count and apart2.min() < (0.25 * size[i]) ** 2:
+            continue
+        taken[count], count = xy[i], count + 1
         keep[i] = 1.0
     return keep
 

@@ -16,6 +16,7 @@ a channel. This variation (γ, τ) is solved for together with L, each of its nu
 copies show it to vary (`learn_variation`): what does not vary costs no information.
 """
 
+import functools
 from typing import NamedTuple
 
 import cv2
@@ -34,10 +35,13 @@ _MOTION, _BLUR, _VARIATION, _LIGHT = slice(1, 7), slice(7, 10), slice(10, None),
 _ROWS = 30_000  # cv2.remap takes maps of fewer than 32768 rows
 
 
+@functools.lru_cache(maxsize=64)
 def patch_grid(half: int, spacing: float) -> Array:
-    """Sample points ((2 half + 1)², 2) of a square patch, row by row, in texton units; the centre is the origin."""
+    """Sample points ((2 half + 1)², 2) of a square patch, row by row, in texton units; the centre is the origin. Read-only."""
     axis = np.arange(-half, half + 1, dtype=np.float32) * np.float32(spacing)
-    return np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    points.setflags(write=False)
+    return points
 
 
 def sample(image: Array, xy: Array, frames: Array, points: Array) -> Array:

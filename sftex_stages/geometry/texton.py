@@ -202,7 +202,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         for _ in range(3):
             inlier = posterior(residual, noise2, contrast2, prior, samples)
             noise2 = float(max((inlier * residual).sum() / max(inlier.sum(), 1e-6), settings.noise_floor**2 * contrast2, 1e-12))
-            prior = float(np.clip(inlier.mean(), 0.05, 0.98))
+            prior = min(max(float(inlier.mean()), 0.05), 0.98)
         if inlier.sum() < 2.5:
             return None
         seen_by = frames  # the frames that `patches` were sampled through
@@ -241,7 +241,8 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         # M-step for the appearance
         points = patch_grid(half, spacing)
         patches = sample(image, xy, frames, points)
-        gain = gain / np.median(gain[inlier > 0.5]) if (inlier > 0.5).any() else gain
+        sure = inlier > 0.5
+        gain = gain / np.median(gain[sure]) if sure.any() else gain
         shares = inlier * _sharpness(frames)
         light, tint = np.split(variation, [len(variation[0]) - values.shape[-1]], 1)
         powers = light_powers(points, template.radius)
@@ -251,7 +252,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         if (weights > 0).sum() < 9:
             return None
         settled = iteration >= max(settings.affine_iterations, last_growth) + 2 * _UPGRADE_EVERY
-        if settled and np.median(np.abs(step[inlier > 0.5, :4]).max(1)) < _SETTLED:
+        if settled and np.median(np.abs(step[sure, :4]).max(1)) < _SETTLED:
             break
     # EM that has settled would not change any more: its last state stands for the iterations that were not needed
     history += [(k, xy, frames, inlier) for k in PROGRESS if iteration < k <= settings.iterations]
