@@ -49,6 +49,7 @@ class HintParams(StageParams):
     near: tuple[Point, ...] = Field((), description="Points [x, y] px that stand out toward the camera")
     far: tuple[Point, ...] = Field((), description="Points [x, y] px that lie back")
     convex: tuple[Disc, ...] = Field((), description="Discs [x, y, radius] px that bulge toward the camera")
+    convex_mask: bool = Field(False, description="All within the mask (without one: everything) bulges toward the camera")
     light: float | None = Field(
         None, ge=-360, le=360, description="Where the light comes from, degrees: 0 right, 90 above, 180 left, 270 below"
     )
@@ -70,7 +71,8 @@ class Params(StageParams):
     )
     hints: HintParams = Field(
         default_factory=HintParams.model_construct,
-        description="What is known beforehand: near, far: [[x, y], …]; convex: [[x, y, radius], …]; light: degrees",
+        description="What is known beforehand: near, far: [[x, y], …]; convex: [[x, y, radius], …]; convex_mask: whether all "
+        "within the mask is convex; light: degrees",
     )
     min_inlier: float = Field(
         0.8, ge=0, le=1, description="Posterior above which an instance is used (the paper's 0.8)"
@@ -285,7 +287,7 @@ def read_hints(params: HintParams, shape: tuple[int, int]) -> mirror.Hints:
     turn = None if params.light is None else np.radians(params.light)
     light = None if turn is None else np.array([np.cos(turn), -np.sin(turn)])
     near, far, convex = (np.array(v, float).reshape(-1, k) for v, k in zip(lists.values(), (2, 2, 3), strict=True))
-    return mirror.Hints(near, far, convex, light)
+    return mirror.Hints(near, far, convex, light, params.convex_mask)
 
 
 def element_sizes(instances: Instances, nodes: pooling.Nodes, spacing: float) -> perspective.Sizes | None:

@@ -231,6 +231,7 @@ def as_given(out, gradient):
         ({"far": [[180, 150]]}, -1),
         ({"near": [[20, 20]], "far": [[180, 150]]}, -1),
         ({"convex": [[180, 150, 60]]}, 1),
+        ({"convex_mask": True}, 1),
     ],
 )
 def test_hints_decide_between_a_dome_and_a_hollow(hints, sign):
@@ -267,6 +268,18 @@ def test_pieces_that_lie_apart_have_signs_and_votes_of_their_own():
     assert out["region_margin"].shape == (2,) and (out["region_margin"] > 5).all()
 
 
+def test_a_convex_mask_turns_every_piece_toward_the_camera():
+    xy = jittered(SHAPE, 14)
+    xy = xy[np.abs(xy[:, 0] - 180) > 50]
+    centre = lambda at: np.where(at[..., :1] < 180, 65.0, 295.0) * [1, 0] + [0, 150.0]  # noqa: E731
+    domes = lambda at: (centre(at) - at) / 180  # noqa: E731
+    frontal = instances_of((xy, domes(xy)), noise=0.005)
+    params = surface.Params(hints=surface.HintParams(convex_mask=True, light=90.0), **QUICK)
+    out = surface.run({"image": image(), "frontal": frontal}, params)
+    assert out["piece"].max() == 2 and (out["vote/hint"] > 100).all()
+    assert as_given(out, domes) > 0.97
+
+
 @pytest.mark.parametrize("start", ["cylinder", "sphere", "plane"])
 def test_start_shape_can_be_chosen(start):
     xy = jittered(SHAPE, 24)
@@ -289,6 +302,7 @@ def test_a_hint_outside_of_the_image_is_refused():
     [
         ("hints: {near: [[1, 2, 3]]}", "surface.hints.near"),
         ("hints: {convex: [[1, 2, 0]]}", "surface.hints.convex.0.2: should be greater than 0"),
+        ("hints: {convex_mask: 1}", "surface.hints.convex_mask: should be a valid boolean"),
         ("hints: {lihgt: 90}", "surface.hints.lihgt: unknown key"),
         ("start: cone", "surface.start"),
     ],
@@ -302,4 +316,4 @@ def test_mistakes_in_hints_name_their_key_and_line(yaml, words):
 def test_hints_are_read_from_yaml():
     text = "surface:\n  hints:\n    near: [[10, 20.5]]\n    light: 90\n"
     hints = config.parse(text, [surface.STAGE])["surface"].hints
-    assert hints.near == ((10.0, 20.5),) and hints.light == 90 and hints.far == ()
+    assert hints.near == ((10.0, 20.5),) and hints.light == 90 and hints.far == () and not hints.convex_mask

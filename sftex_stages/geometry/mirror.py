@@ -25,12 +25,14 @@ EXHAUSTIVE = 12  # pieces up to which all patterns of signs are tried
 @dataclass(frozen=True)
 class Hints:
     """What is known beforehand: `near`, `far` (K, 2) px stand out toward the camera or lie back; discs `convex` (K, 3) = (x, y,
-    radius) bulge toward it; unit direction `light` (2,) in the image that light comes from, None if not told."""
+    radius) bulge toward it, or `everything` does; unit direction `light` (2,) in the image that light comes from, None if not
+    told."""
 
     near: Float
     far: Float
     convex: Float
     light: Float | None
+    everything: bool = False
 
 
 def pieces(xy: Float, reach: float) -> Int:
@@ -80,7 +82,7 @@ def scale(total: float, size: Float, weight: Float, h: Float, piece: Int, count:
 
 
 def hint(hints: Hints, xy: Float, g: Float, h: Float, piece: Int, count: int) -> Float:
-    """Nats (P,) of near and far points and of convex discs, for heights `h` (N,) and slopes `g` (N, 2) of nodes `xy` (N, 2)."""
+    """Nats (P,) of near and far points and convex places, for heights `h` (N,) and slopes `g` (N, 2) of nodes `xy` (N, 2)."""
     votes = np.zeros(count)
     tree = cKDTree(xy)
     for points, toward in ((hints.near, 1.0), (hints.far, -1.0)):
@@ -97,10 +99,17 @@ def hint(hints: Hints, xy: Float, g: Float, h: Float, piece: Int, count: int) ->
         if len(inside) < 3:
             inside = tree.query([x, y], min(6, len(xy)))[1].reshape(-1)
         p = int(np.bincount(piece[inside]).argmax())
-        inside = inside[piece[inside] == p]
-        offset = xy[inside] - xy[inside].mean(0)
-        votes[p] -= HINT * np.sign((offset * (g[inside] - g[inside].mean(0))).sum())
+        votes[p] += HINT * _convex(xy, g, inside[piece[inside] == p])
+    if hints.everything:
+        votes += HINT * np.array([_convex(xy, g, np.flatnonzero(piece == p)) for p in range(count)])
     return votes
+
+
+def _convex(xy: Float, g: Float, inside: Int) -> float:
+    """1 if the surface of slopes `g` (N, 2) bulges toward the camera over the nodes `inside`, −1 if away, 0 if neither: by its
+    mean curvature, so that a lean does not count."""
+    offset = xy[inside] - xy[inside].mean(0)
+    return -float(np.sign((offset * (g[inside] - g[inside].mean(0))).sum()))
 
 
 def decide(votes: Float, ties: Float) -> Float:

@@ -52,6 +52,15 @@ def test_hints_vote_for_the_piece_they_lie_in(two_bowls, told, votes):
     assert np.array_equal(mirror.hint(told, xy, g, h, piece, 2), mirror.HINT * np.array(votes))
 
 
+def test_a_convex_mask_speaks_for_every_piece(two_bowls):
+    xy, g, h, piece = two_bowls
+    told = mirror.Hints(NOTHING, NOTHING, NO_DISC, None, everything=True)
+    lean = np.array([0.9, -0.4])
+    assert np.array_equal(mirror.hint(told, xy, g + lean, h + xy @ lean, piece, 2), mirror.HINT * np.array([1, -1]))
+    lone = np.append(piece[:-1], 2)  # a piece of one node bulges nowhere
+    assert mirror.hint(told, xy, g, h, lone, 3)[2] == 0
+
+
 def test_a_convex_disc_on_a_slope_is_about_its_curvature(two_bowls):
     xy, g, h, piece = two_bowls
     lean = np.array([0.9, -0.4])
