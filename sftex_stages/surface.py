@@ -15,7 +15,9 @@ from sftex_stages.geometry import (
     blocks,
     calibration,
     confidence,
+    direct,
     gaussian,
+    imaging,
     mirror,
     perspective,
     pooling,
@@ -81,7 +83,13 @@ class Params(StageParams):
     nodes: int = Field(1500, ge=50, le=20000, description="Most nodes that the sign search pools the instances in")
     detail: float = Field(0.8, gt=0.2, le=4, description="Spacing of the surface's grid, in mean spacings of nodes")
     shading: bool = Field(True, description="Use irradiance against normals as a cue for signs")
+    direct: int = Field(
+        0, ge=0, le=5, description="Rounds of the direct method: instances registered again as the surface shows them"
+    )
     finalists: int = Field(4, ge=1, le=50, description="Sign patterns that are compared by their full evidence")
+
+
+STEEP = 3.5  # slope (74 degrees) beyond which instances are not registered again any steeper: nothing is left of them
 
 
 @dataclass(frozen=True)
@@ -203,10 +211,66 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     instances, nodes, fine, solution = recalibrate(
         instances, nodes, fine, solution, camera, spacing, params, height
     )
+    for _ in range(params.direct):
+        rows = look_again(inputs, rows, fine.grid, solution.a, camera, params)
+        instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, spacing, params)
     results = outputs(mask, instances, nodes, solution, fine, spacing, camera)
     results["instance/sign_margin"] = margin.astype(np.float32)
     results |= verdict.by_piece(results["piece"], before, found, regions, rise)
     return results | record(candidates, found.mirrored)
+
+
+def look_again(
+    inputs: Mapping[str, Any], rows: Arrays, grid: spline.Grid, a: Float, camera: perspective.Camera, params: Params
+) -> Arrays:
+    """The instances `rows` registered again as the surface of coefficients `a` (M,) shows them (`direct.py`)."""
+    xy = rows["xy"].astype(float)
+    index, stencil = camera.stencil(grid, xy)
+    slope = refine.limit(np.einsum("npk,nk->np", stencil, a[index]), STEEP)
+    p = direct.foreshortening(slope, camera, xy)
+    rgb = inputs["image"]["rgb"]
+    levels: dict[int, Float] = {}
+    rows = {name: value.copy() for name, value in rows.items()}
+    for k in np.unique(rows["texton"]):
+        part = inputs["frontal"][k]
+        element = direct.Element(part["appearance"], part["domain"], float(part["spacing"]), float(part["blur"]))
+        level = direct.level_of(element.spacing)
+        if level not in levels:
+            levels[level] = direct.at_level(rgb, level)
+        at = np.flatnonzero(rows["texton"] == k)
+        transform, inlier = rows["transform"][at].astype(float), rows["inlier"][at].astype(float)
+        seen = direct.look_again(levels[level], 2.0**-level, element, xy[at], transform, inlier, p[at], params.min_inlier)
+        if seen is None:
+            continue
+        rows["inlier"][at] = seen.inlier
+        new = at[seen.moved]
+        rows["xy"][new], rows["transform"][new] = seen.xy[seen.moved], seen.transform[seen.moved]
+        s = seen.transform[seen.moved]
+        tensor = imaging.tensor_of(s, np.linalg.svd(s, compute_uv=False)[:, 0]) if len(new) else np.zeros((0, 3))
+        rows["tensor"][new] = tensor
+        rows["normal"][new] = imaging.normal_of_tensor(tensor)
+    return rows
+
+
+def refine_again(
+    rows: Arrays,
+    field: gaussian.Field,
+    solution: refine.Solution,
+    camera: perspective.Camera,
+    spacing: float,
+    params: Params,
+) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
+    """The surface refined from instances `rows` that were registered again."""
+    instances = prepare(rows, params, camera)
+    nodes = pool(instances, spacing, params)
+    sizes = element_sizes(instances, nodes, spacing) if camera.bend else None
+    height = sizes.heights(camera, nodes.xy, nodes.w, np.log(camera.rays(nodes.xy)[1])) if sizes else None
+    field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
+    start = gaussian.gradients(field, solution.a)
+    solution = refine.refine(
+        field, nodes.w, nodes.covariance, nodes.weight, start, solution.smooth, 2, height=height, noise=solution.noise
+    )
+    return recalibrate(instances, nodes, field, solution, camera, spacing, params, height)
 
 
 def recalibrate(

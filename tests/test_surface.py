@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from synthetic import detect_of, image_of, render
 from synthetic_instances import instances_of, jittered
 
-from sftex_stages import config, surface
+from sftex_stages import config, frontal, surface
 from sftex_stages.errors import ConfigError, StageError
 from sftex_stages.geometry import perspective, tensors
 
@@ -280,6 +281,27 @@ def test_a_convex_mask_turns_every_piece_toward_the_camera():
     assert as_given(out, domes) > 0.97
 
 
+def test_the_direct_method_takes_back_what_registration_had_given_up():
+    scene = render(radius=17, pitch=40, size=360)
+    members = {"label": np.zeros(len(scene.xy), np.int32), "count": np.array(1)}
+    inputs = {"image": image_of(scene), "detect": detect_of(scene, np.random.default_rng(1)), "cluster": members, "part": 0}
+    part = frontal.run(inputs, frontal.Params())
+    lost = np.flatnonzero(part["inlier"] > 0.8)[::6]
+    part["inlier"][lost] = 0.3
+    part["transform"][lost] = part["transform"][lost] @ np.array([[1.12, 0.1], [0.0, 0.92]], np.float32)
+    given = {"image": inputs["image"], "frontal": [part]}
+    out, plain = (surface.run(given, surface.Params(direct=k, finalists=1, camera="orthographic")) for k in (1, 0))
+    assert (plain["instance/inlier"][lost] < 0.8).all()
+    lost = lost[out["instance/inlier"][lost] > 0.8]
+    assert len(lost) >= 6  # of 9; at the border the others leave the surface too free
+    near = np.linalg.norm(scene.xy - part["xy"][lost, None], axis=2).argmin(1)
+    normal, true = out["instance/normal"][lost], scene.normal[near]
+    off = [np.degrees(np.arccos(np.clip((normal * m * true).sum(1), -1, 1))) for m in ([1, 1, 1], [-1, -1, 1])]
+    assert np.median(np.minimum(*off)) < 2
+    rest = part["inlier"] > 0.8
+    assert np.array_equal(out["instance/transform"][rest], part["transform"][rest])
+
+
 @pytest.mark.parametrize("start", ["cylinder", "sphere", "plane"])
 def test_start_shape_can_be_chosen(start):
     xy = jittered(SHAPE, 24)
@@ -302,6 +324,7 @@ def test_a_hint_outside_of_the_image_is_refused():
     [
         ("hints: {near: [[1, 2, 3]]}", "surface.hints.near"),
         ("hints: {convex: [[1, 2, 0]]}", "surface.hints.convex.0.2: should be greater than 0"),
+        ("direct: 9", "surface.direct"),
         ("hints: {convex_mask: 1}", "surface.hints.convex_mask: should be a valid boolean"),
         ("hints: {lihgt: 90}", "surface.hints.lihgt: unknown key"),
         ("start: cone", "surface.start"),
