@@ -283,23 +283,23 @@ def recalibrate(
     params: Params,
     height: gaussian.Heights | None,
 ) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
-    """Textons corrected by the surface, and the surface refined from them: one round of the alternation."""
+    """Textons corrected by the surface, and the surface refined from them: one round of the alternation. Then the prior learns
+    where the surface is rough."""
     index, stencil = camera.stencil(field.grid, instances.xy)
     seen, _ = tensors.predict(np.einsum("npk,nk->np", stencil, solution.a[index]))
     transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
     found = calibration.against_surface(
         instances.calibration, transform, instances.covariance, instances.texton, instances.trust, seen
     )
-    if np.array_equal(found.e, instances.calibration.e):
-        return instances, nodes, field, solution
-    instances = replace(instances, calibration=found)
-    nodes = pool(instances, spacing, params)
-    field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
-    start, smooth = gaussian.gradients(field, solution.a), solution.smooth
-    solution = refine.refine(
-        field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 1, height=height, noise=solution.noise
-    )
-    return instances, nodes, field, solution
+    if not np.array_equal(found.e, instances.calibration.e):
+        instances = replace(instances, calibration=found)
+        nodes = pool(instances, spacing, params)
+        field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
+        start, smooth = gaussian.gradients(field, solution.a), solution.smooth
+        solution = refine.refine(
+            field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 2, height, solution.noise, solution.height_noise
+        )
+    return instances, nodes, *refine.refine_locally(field, nodes.w, nodes.covariance, nodes.weight, solution, height)
 
 
 def pool(instances: Instances, spacing: float, params: Params) -> pooling.Nodes:

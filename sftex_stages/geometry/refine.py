@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sftex_stages.geometry import blocks, gaussian, tensors
+from sftex_stages.geometry import blocks, gaussian, roughness, tensors
 
 Float = NDArray[np.floating]
 
@@ -78,6 +78,8 @@ def refine(
     rounds: int = 4,
     height: gaussian.Heights | None = None,
     noise: float = 1.0,
+    height_noise: float = 2.0,
+    tune: bool = True,
 ) -> Solution:
     """The surface from tensors `w` (N, 2) with `covariance` (N, 2, 2), trusted by `trust` (N,) in 0…1.
 
@@ -86,17 +88,18 @@ def refine(
     start : (N, 2)
         gradients with their signs decided; only where it starts, the tensors decide the rest.
     rounds : int
-        of: smoothness and noise by one pattern search step, two Gauss-Newton steps, new robust weights.
-    noise
-        factor on `covariance` to start from.
+        of: smoothness and noise by one pattern search step, two Gauss-Newton steps, new robust weights. The first has no
+        weights to go by.
     height
         heights, their precisions up to one noise factor, if they are measured (element size under perspective).
+    noise, height_noise
+        factors on `covariance`, and on the heights' variance, to start from; `tune=False` keeps them and the smoothness.
     """
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
     x, pace = np.log([smooth.strength, smooth.reach, noise]), np.array([0.7, 0.7, 0.7])
     if height is not None:
-        x, pace = np.append(x, np.log(2.0)), np.append(pace, 0.7)
+        x, pace = np.append(x, np.log(height_noise)), np.append(pace, 0.7)
 
     def rise(x: Float) -> gaussian.Heights | None:
         return None if height is None else height.over(float(np.exp(x[3])))
@@ -111,8 +114,9 @@ def refine(
         return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach), rise(x))
 
     for _ in range(rounds):
-        x, moved = climb(score, x, pace)
-        pace = pace if moved else pace / 2
+        if tune:
+            x, moved = climb(score, x, pace)
+            pace = pace if moved else pace / 2
         strength, reach, noise = map(float, np.exp(x[:3]))
         smooth = gaussian.Smoothness(strength, reach)
         for _ in range(2):
@@ -123,6 +127,26 @@ def refine(
         mean, alone = gaussian.without_own(g, spread, information, pull)
         robust = trust * student(w, precision / noise, limit(mean), alone)[0]
     return Solution(a, factor, g, spread, robust, smooth, noise, score(x), float(np.exp(x[3])) if len(x) > 3 else 1.0)
+
+
+def refine_locally(
+    f: gaussian.Field,
+    w: Float,
+    covariance: Float,
+    trust: Float,
+    found: Solution,
+    height: gaussian.Heights | None = None,
+    passes: int = 2,
+) -> tuple[gaussian.Field, Solution]:
+    """The surface `found` refined under a prior that is rougher where it is rough (`roughness.py`), and the field with that
+    prior. Overall smoothness and noise stay as found."""
+    shaped = f
+    for _ in range(passes):
+        shaped = roughness.shaped(f, roughness.learn(f, found.a, found.factor, found.smooth).factor)
+        found = refine(
+            shaped, w, covariance, trust, found.gradient, found.smooth, 3, height, found.noise, found.height_noise, tune=False
+        )
+    return shaped, found
 
 
 def climb(score: Callable[[Float], float], x: Float, pace: Float) -> tuple[Float, bool]:

@@ -4,10 +4,11 @@ Every smoothness of a ladder, smooth to rough, anneals all starts (leading eigen
 directions, leaning planes, a bowl, lights from six azimuths), with and without shading, moves whole regions, and hands its
 patterns on as starts of the next. The best distinct patterns then flip regions of every size (`sign_regions.py`) and are
 judged by their evidence, each with its own best smoothness and noise and with outliers let go, so that patterns found
-with different settings compare.
+with different settings compare. Those that come near the best are reconsidered under a prior that is rough where their surface
+is (`roughness.py`): one smoothness for all prefers patterns that iron folds out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, shading, sign_regions, signs, surface_em
+from sftex_stages.geometry import blocks, gaussian, roughness, shading, sign_regions, signs, surface_em
 from sftex_stages.geometry.refine import climb
 
 Float = NDArray[np.floating]
@@ -25,6 +26,8 @@ LADDER = ((3.0, 8.0), (1.0, 4.0), (1.0, 2.0), (1.0, 0.7))  # strength, reach in 
 EM_SPACING = 1.5  # of the radial functions, in spacings of nodes
 ANNEAL_STEPS, LIGHT_EVERY = 24, 6
 OUTLIER = 0.05  # prior share of nodes that are not from the surface
+MOST_REGIONS = 400  # that patterns may differ in to be exchanged
+AFTERTHOUGHT, PASSES = 100.0, 2  # nats behind the best up to which a pattern is reconsidered, and how often
 SAY_OF_SHADING = 0.5  # of its log likelihood: what one light does not explain is correlated between neighbours
 
 
@@ -55,6 +58,7 @@ class Candidate:
     light: shading.Light | None
     origin: str
     tuned: bool  # whether smoothness and noise were searched for it, or are those it was found at
+    rough: Float | None = None  # factors of the blocks of the prior (`roughness.py`)
 
     @property
     def evidence(self) -> float:
@@ -247,13 +251,52 @@ def search(
         judge(data, f, moved[k], first[k].smooth, first[k].noise, 2, first[k].origin)
         for k in distinct(np.stack(moved, 1), data.trust, 0.995)
     ]
-    return sorted(last, key=lambda x: -x.evidence) + first[finalists:]
+    best = max(x.evidence for x in last)
+    near = [x for x in last if x.evidence > best - AFTERTHOUGHT]
+    behind = [replace(x, tuned=False) for x in last if x.evidence <= best - AFTERTHOUGHT]
+    last = sorted(reconsider(data, f, near, pairs), key=lambda x: -x.evidence)
+    return last + behind + first[finalists:]
+
+
+def reconsider(data: Data, f: gaussian.Field, found: list[Candidate], pairs: tuple[Int, Int]) -> list[Candidate]:
+    """The candidates under a prior that is rough where their own surface is; their evidence includes what that costs.
+
+    What they disagree in are regions (of the graph of `pairs`) that may be exchanged: each takes over what helps it.
+    """
+    for n in range(PASSES):
+        label = disputed(np.stack([x.s for x in found], 1), data.trust, pairs)
+        found = [_rethink(data, f, x, label, last=n == PASSES - 1) for x in found]
+    return found
+
+
+def disputed(patterns: Float, trust: Float, pairs: tuple[Int, Int]) -> Int:
+    """Label (N,) of the regions within which the patterns (N, S), turned as a whole to agree best, differ alike."""
+    relative = patterns * patterns[:, :1]
+    relative = relative * np.where(trust @ relative < 0, -1.0, 1.0)
+    return components(len(patterns), pairs, (relative[pairs[0]] == relative[pairs[1]]).all(1))
+
+
+def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool) -> Candidate:
+    """One pass of `reconsider`; the `last` one states the evidence at the roughness of the surface found."""
+    c = own_coupling(data, f, x)
+    rough = roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth).factor
+    x = replace(x, rough=rough)
+    shaped = roughness.shaped(f, rough)
+    if 0 < label.max() < MOST_REGIONS:
+        c = own_coupling(data, f, x)
+        x = replace(x, s=signs.flip_regions(c, x.s, bias_of(data, x.s[:, None], np.ones(1, bool), [None])[:, 0], label))
+    s = settle(data, f, x)
+    x = replace(judge(data, shaped, s, x.smooth, x.noise, 2, x.origin), rough=rough)
+    if not last:
+        return x
+    c = own_coupling(data, f, x)
+    return replace(x, shape=x.shape + roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth).bound)
 
 
 def own_coupling(data: Data, f: gaussian.Field, found: Candidate) -> signs.Coupling:
-    """The coupling at the candidate's own smoothness and noise, without its outliers."""
+    """The coupling at the candidate's own smoothness, roughness and noise, without its outliers."""
     weight = np.linalg.inv(data.covariance) * (found.inside / found.noise)[:, None, None]
-    return signs.coupling(f, data.d, weight, found.smooth)
+    return signs.coupling(roughness.shaped(f, found.rough), data.d, weight, found.smooth)
 
 
 def rivals(data: Data, c: signs.Coupling, s: Float) -> tuple[list[Int], Float]:

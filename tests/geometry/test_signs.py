@@ -138,3 +138,31 @@ def test_radial_gradient_against_finite_differences():
         e = 1e-5 * np.eye(2)[k]
         numeric = (surface_em.radial(xy + e, centres, 20.0) - surface_em.radial(xy - e, centres, 20.0)) / 2e-5
         assert np.abs(numeric - gradient[:, k]).max() < 1e-9
+
+
+def test_patterns_that_are_wrong_in_different_places_mend_one_another():
+    xy, d, covariance, truth, _ = problem(200, 2)
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 10.0), xy)
+    data = data_of(xy, d, covariance, None)
+    pairs = sign_search.neighbours(xy)
+    low, left = np.where(xy[:, 1] > 60, -1.0, 1.0), np.where(xy[:, 0] < 30, -1.0, 1.0)
+    patterns = np.stack((truth * low, -truth * left), 1)
+    label = sign_search.disputed(patterns, data.trust, pairs)
+    wrong = low * left < 0  # where they differ, the whole turned
+    assert all(len(set(wrong[label == k])) == 1 for k in np.unique(label)) and label.max() >= 1
+    smooth = gaussian.Smoothness(1.0, 40.0)
+    given = [sign_search.judge(data, f, s, smooth, 1.0, 2, "given") for s in patterns.T]
+    found = sign_search.reconsider(data, f, given, pairs)
+    assert all(abs((x.s * truth).mean()) > 0.99 for x in found)
+    assert all(x.rough is not None and x.evidence > y.evidence for x, y in zip(found, given, strict=True))
+
+
+def test_roughness_of_its_own_is_in_a_candidates_coupling():
+    xy, d, covariance, truth, _ = problem(200, 2)
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 10.0), xy)
+    data = data_of(xy, d, covariance, None)
+    plain = sign_search.judge(data, f, truth, gaussian.Smoothness(1.0, 40.0), 1.0, 1, "truth")
+    found = sign_search.reconsider(data, f, [plain], sign_search.neighbours(xy))[0]
+    c = sign_search.own_coupling(data, f, found)
+    assert np.allclose(signs.surface_of(c, found.s), found.a, rtol=0.05, atol=0.05 * np.abs(found.a).max())
+    assert not np.allclose(c.factor.band, sign_search.own_coupling(data, f, plain).factor.band)
