@@ -45,11 +45,15 @@ def merge(agreement: Float, pairs: tuple[Int, Int], n: int) -> list[Int]:
         for k, (total, count) in links[y].items():
             before = joined.get(k, (0.0, 0))
             joined[k] = (before[0] + total, before[1] + count)
-        joined = {k: v for k, v in joined.items() if k not in (x, y)}
-        for k, (total, count) in joined.items():
-            links[k] = {j: v for j, v in links[k].items() if j not in (x, y)} | {new: (total, count)}
-            heapq.heappush(heap, (-total / count, k, new))
-        links[new] = joined
+        joined.pop(x, None)
+        joined.pop(y, None)
+        for k, mean in joined.items():
+            theirs = links[k]
+            theirs.pop(x, None)
+            theirs.pop(y, None)
+            theirs[new] = mean
+            heapq.heappush(heap, (-mean[0] / mean[1], k, new))
+        links[new], links[x], links[y] = joined, {}, {}
         member.append(member[x] + member[y])
     return [np.array(m) for m in member[n:]]
 
@@ -78,7 +82,9 @@ def rivals(c: signs.Coupling, d: Float, s: Float, bias: Float, pairs: tuple[Int,
     regions = [np.array([k]) for k in range(n)]
     for region in merge(agreement, pairs, n):
         if 2 * len(region) > n:
-            region = np.setdiff1d(np.arange(n), region)
+            rest = np.ones(n, bool)
+            rest[region] = False
+            region = np.flatnonzero(rest)
         if len(region):
             regions.append(region)
     single = 2 * s * (signs.product(c, s) - c.own * s + bias)
