@@ -297,7 +297,7 @@ def recalibrate(
         field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
         start, smooth = gaussian.gradients(field, solution.a), solution.smooth
         solution = refine.refine(
-            field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 2, height, solution.noise, solution.height_noise
+            field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 1, height, solution.noise, solution.height_noise
         )
     return instances, nodes, *refine.refine_locally(field, nodes.w, nodes.covariance, nodes.weight, solution, height)
 

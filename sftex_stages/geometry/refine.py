@@ -18,6 +18,7 @@ Float = NDArray[np.floating]
 FREEDOM = 4.0  # of the Student distribution; two dimensions
 NOISE_FACTORS = (0.05, 50.0)
 HEIGHT_FACTORS = (0.1, 100.0)
+LOCAL_ROUNDS = (1, 1, 2)  # of each pass that learns where the surface is rough; only those beyond the first weigh by residuals
 
 
 @dataclass(frozen=True)
@@ -136,16 +137,17 @@ def refine_locally(
     trust: Float,
     found: Solution,
     height: gaussian.Heights | None = None,
-    passes: int = 2,
 ) -> tuple[gaussian.Field, Solution]:
     """The surface `found` refined under a prior that is rougher where it is rough (`roughness.py`), and the field with that
-    prior. Overall smoothness and noise stay as found."""
+    prior. Overall smoothness and noise stay as found.
+
+    At first nothing is let go: what looks like outliers to a smooth prior may be a fold to a rough one.
+    """
     shaped = f
-    for _ in range(passes):
+    for rounds in LOCAL_ROUNDS:
         shaped = roughness.shaped(f, roughness.learn(f, found.a, found.factor, found.smooth).factor)
-        found = refine(
-            shaped, w, covariance, trust, found.gradient, found.smooth, 3, height, found.noise, found.height_noise, tune=False
-        )
+        start, smooth, noise = found.gradient, found.smooth, found.noise
+        found = refine(shaped, w, covariance, trust, start, smooth, rounds, height, noise, found.height_noise, tune=False)
     return shaped, found
 
 
