@@ -425,7 +425,7 @@ def outputs(
     state = posterior_states(instances, g, spread)
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
     maps = support.dense(field, solution.a, mask.shape, instances.xy[seen], spacing, errors)
-    piece = support.pieces(maps["supported"] & mask, spacing**2)
+    piece = support.pieces(support.close_holes(maps["supported"] & mask, maps["closable"] & mask), spacing**2)
     valid = piece > 0
     nan = np.float32(np.nan)
     mean = maps["height"][valid].mean() if valid.any() else 0.0

@@ -1,6 +1,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from sftex_stages.geometry import blocks, confidence, gaussian, perspective, pooling, refine, spline, support, tensors
 
@@ -58,18 +59,23 @@ def test_linearised_tensors_have_the_residual_and_slope_of_the_exact_ones():
         assert np.abs((cost(g + e) - cost(g - e)) / 2e-6 - slope[:, k]).max() < 1e-6
 
 
+def sure_errors(xy):
+    """A field over 300 x 300 px measured well at `xy` (N, 2), and what is known of its errors."""
+    f = gaussian.make_field(spline.cover(np.full(2, -40.0), np.full(2, 340.0), 20.0), xy)
+    weight = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
+    factor = gaussian.posterior(f, weight, gaussian.prior(f, gaussian.Smoothness(1.0, 30.0)))
+    inverse = blocks.selected_inverse(factor)
+    unmoved = np.zeros((f.grid.size, 1))
+    return f, confidence.Errors(xy, np.zeros_like(xy), np.full(len(xy), 0.7), 0.004, unmoved, f.grid, inverse)
+
+
 def test_support_follows_the_surface_and_leaves_holes():
     rng = np.random.default_rng(3)
     x, y = np.meshgrid(np.arange(10.0, 300, 20), np.arange(10.0, 300, 20))
     xy = np.stack((x.ravel(), y.ravel()), 1)
     hole = np.hypot(xy[:, 0] - 150, xy[:, 1] - 150) < 80
     xy = xy[~hole] + rng.normal(size=(int((~hole).sum()), 2))
-    f = gaussian.make_field(spline.cover(np.full(2, -40.0), np.full(2, 340.0), 20.0), xy)
-    weight = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
-    factor = gaussian.posterior(f, weight, gaussian.prior(f, gaussian.Smoothness(1.0, 30.0)))
-    inverse = blocks.selected_inverse(factor)
-    unmoved = np.zeros((f.grid.size, 1))
-    errors = confidence.Errors(xy, np.zeros_like(xy), np.full(len(xy), 0.7), 0.004, unmoved, f.grid, inverse)
+    f, errors = sure_errors(xy)
     maps = support.dense(f, np.zeros(f.grid.size), (300, 300), xy, 20.0, errors)
     assert not maps["supported"][150, 150] and maps["supported"][20, 20] and maps["supported"][299, 150]
     assert 0.6 < maps["supported"].mean() < 0.95
@@ -88,6 +94,36 @@ def test_pieces_are_connected_and_no_specks():
     assert (label[5:35, 20:50] == 1).all() and (label[5:15, 5:15] == 2).all()
     assert label[38, 58] == 0 and label[15, 15] == 0 and label.dtype == np.int32
     assert ((label > 0).sum() == 1000) and (support.pieces(valid & False, 1.0) == 0).all()
+
+
+def test_holes_are_closed_where_support_all_around_would_do():
+    supported = np.ones((40, 60), bool)
+    closable = np.zeros_like(supported)
+    supported[5:8, 5:9] = False  # a speck
+    closable[5:8, 5:9] = True
+    supported[20:30, 10:20] = False  # a gap: its middle is out of all reach
+    closable[20:30, 10:20] = True
+    closable[24:26, 14:16] = False
+    supported[15:18, :6] = False  # open toward the border
+    closable[15:18, :6] = True
+    supported[4:7, 40:43] = supported[7:9, 43:46] = False  # two that touch at a corner are one, and it is not closable
+    closable[4:7, 40:43] = True
+    closed = support.close_holes(supported, closable)
+    assert closed[5:8, 5:9].all()
+    assert np.array_equal(closed[10:], supported[10:]) and np.array_equal(closed[:, 30:], supported[:, 30:])
+    everything = np.ones((4, 4), bool)
+    assert support.close_holes(everything, everything).all() and not support.close_holes(~everything, everything).any()
+
+
+@pytest.mark.parametrize(("radius", "closed"), [(80, False), (50, True)])
+def test_a_place_a_little_out_of_reach_is_closed(radius, closed):
+    x, y = np.meshgrid(np.arange(10.0, 300, 20), np.arange(10.0, 300, 20))
+    xy = np.stack((x.ravel(), y.ravel()), 1)
+    f, errors = sure_errors(xy[np.hypot(xy[:, 0] - 150, xy[:, 1] - 150) > radius])
+    maps = support.dense(f, np.zeros(f.grid.size), (300, 300), errors.xy, 20.0, errors)
+    assert not maps["supported"][150, 150]
+    assert support.close_holes(maps["supported"], maps["closable"])[150, 150] == closed
+
 
 
 def refined(rng, count=3000, textons=8, shear=0.0, noise=0.02):
