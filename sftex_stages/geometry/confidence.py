@@ -24,10 +24,11 @@ Int = NDArray[np.integer]
 
 NEAR = 24  # instances that speak for a place
 UPPER_QUARTILE = float(np.log(4.0))  # of half a chi-square of two degrees of freedom
-NOISE_FACTORS = (0.05, 20.0)
+NOISE_FACTORS = (0.005, 20.0)
 # Textons on one printed motif err together, so that half as many are independent; the posterior's own share also stands for
-# what lies between instances. Round numbers, the same for all images; chosen among seven settings on twelve images.
-TEXTONS, POSTERIOR = 2.0, 1.5
+# what lies between instances; of what instances nearby err in common half is their own (they often lie on one motif), and half
+# the surface's. Round numbers, the same for all images; chosen among some forty settings on twelve images.
+TEXTONS, POSTERIOR, MISFIT = 2.0, 1.5, 0.5
 CHUNK = 4096  # places at a time: bounded memory
 
 
@@ -94,7 +95,7 @@ def _spread(e: Errors, tree: cKDTree | None, at: Float, g: Float) -> Float:
         return POSTERIOR * posterior + tensors.common_error(g, e.common)
     near = tree.query(at, min(NEAR, len(e.xy)))[1].reshape(len(at), -1)
     noise = np.clip(np.quantile(e.chi2[near], 0.75, axis=1) / UPPER_QUARTILE, *NOISE_FACTORS)
-    misfit = np.sqrt((np.median(e.residual[near], axis=1) ** 2).mean(1))
+    misfit = MISFIT * np.sqrt((np.median(e.residual[near], axis=1) ** 2).mean(1))
     rows = np.arange(0, 2 * index.size + 1, 16)
     design = sp.csr_matrix((stencil.ravel(), np.repeat(index, 2, 0).ravel(), rows), shape=(2 * len(at), e.grid.size))
     moved = np.asarray(design @ e.influence).reshape(len(at), 2, -1)

@@ -176,7 +176,7 @@ def test_noise_and_misfit_nearby_widen_the_spread():
     at = np.array([[100.0, 100], [300.0, 100], [100.0, 380]])
     quiet, noisy, misfit = (np.trace(c) for c in confidence.spread(e, at, g[:3]))
     assert quiet < noisy < misfit
-    shared = tensors.common_error(g[:1], 0.05)[0]
+    shared = tensors.common_error(g[:1], confidence.MISFIT * 0.05)[0]
     assert abs(misfit / np.trace(shared) - 1) < 0.5
     beside = dataclasses.replace(e, common=0.1)
     assert np.allclose(confidence.spread(beside, at, g[:3]) - confidence.spread(e, at, g[:3]),
