@@ -89,6 +89,7 @@ class Params(StageParams):
     finalists: int = Field(4, ge=1, le=50, description="Sign patterns that are compared by their full evidence")
 
 
+ROUGH, CLOSER = 1.5, 0.7  # a surface that varies within so many node spacings is looked at in cells of that share of them
 STEEP = 3.5  # slope (74 degrees) beyond which instances are not registered again any steeper: nothing is left of them
 
 
@@ -197,23 +198,24 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
     choice = choose_camera(nodes, coarse.grid, start, best.smooth, sizes, inputs["image"], params)
     found = verdict.decide(nodes, coarse, coupled, data, best, start, sizes, choice, hints, spacing)
-    camera, height, before = choice.camera, None, nodes.xy
+    camera, before = choice.camera, nodes.xy
     start = found.sign[found.piece, None] * start
     if camera.bend:
         instances = prepare(rows, params, camera)
         nodes = pool(instances, spacing, params)
-        sizes = element_sizes(instances, nodes, spacing)
-        change = np.log(camera.rays(nodes.xy)[1])
-        height = sizes.heights(camera, nodes.xy, nodes.w, change) if sizes else None
         start = start[cKDTree(before).query(nodes.xy)[1]]
+    height = heights(instances, nodes, camera, spacing)
     fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy, camera.stretch(nodes.xy))
     solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, 3, height=height)
-    instances, nodes, fine, solution = recalibrate(
-        instances, nodes, fine, solution, camera, spacing, params, height
-    )
+    pace = spacing
+    if solution.smooth.reach < ROUGH * spacing:
+        pace = CLOSER * spacing
+        grid = spline.cover(low, high, params.detail * pace)
+        nodes, fine, solution, height = refit(instances, grid, fine, solution, camera, pace, params)
+    instances, nodes, fine, solution = recalibrate(instances, nodes, fine, solution, camera, pace, params, height)
     for _ in range(params.direct):
         rows = look_again(inputs, rows, fine.grid, solution.a, camera, params)
-        instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, spacing, params)
+        instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, pace, params)
     results = outputs(mask, instances, nodes, solution, fine, spacing, camera)
     results["instance/sign_margin"] = margin.astype(np.float32)
     results |= verdict.by_piece(results["piece"], before, found, regions, rise)
@@ -262,15 +264,36 @@ def refine_again(
 ) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
     """The surface refined from instances `rows` that were registered again."""
     instances = prepare(rows, params, camera)
-    nodes = pool(instances, spacing, params)
-    sizes = element_sizes(instances, nodes, spacing) if camera.bend else None
-    height = sizes.heights(camera, nodes.xy, nodes.w, np.log(camera.rays(nodes.xy)[1])) if sizes else None
-    field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
-    start = gaussian.gradients(field, solution.a)
-    solution = refine.refine(
-        field, nodes.w, nodes.covariance, nodes.weight, start, solution.smooth, 2, height=height, noise=solution.noise
-    )
+    nodes, field, solution, height = refit(instances, field.grid, field, solution, camera, spacing, params)
     return recalibrate(instances, nodes, field, solution, camera, spacing, params, height)
+
+
+def refit(
+    instances: Instances,
+    grid: spline.Grid,
+    field: gaussian.Field,
+    solution: refine.Solution,
+    camera: perspective.Camera,
+    spacing: float,
+    params: Params,
+) -> tuple[pooling.Nodes, gaussian.Field, refine.Solution, gaussian.Heights | None]:
+    """The surface `solution` on `field` refined from `instances` pooled anew, in cells of `spacing` px, on `grid`."""
+    nodes = pool(instances, spacing, params)
+    stretch = camera.stretch(nodes.xy)
+    start = gaussian.gradients(gaussian.make_field(field.grid, nodes.xy, stretch), solution.a)
+    height = heights(instances, nodes, camera, spacing)
+    field = gaussian.make_field(grid, nodes.xy, stretch)
+    w, covariance, weight = nodes.w, nodes.covariance, nodes.weight
+    solution = refine.refine(field, w, covariance, weight, start, solution.smooth, 3, height, solution.noise)
+    return nodes, field, solution, height
+
+
+def heights(
+    instances: Instances, nodes: pooling.Nodes, camera: perspective.Camera, spacing: float
+) -> gaussian.Heights | None:
+    """What element sizes say of heights at the nodes; None under orthography, or with too few of them."""
+    sizes = element_sizes(instances, nodes, spacing) if camera.bend else None
+    return sizes.heights(camera, nodes.xy, nodes.w, np.log(camera.rays(nodes.xy)[1])) if sizes else None
 
 
 def recalibrate(

@@ -340,3 +340,21 @@ def test_hints_are_read_from_yaml():
     text = "surface:\n  hints:\n    near: [[10, 20.5]]\n    light: 90\n"
     hints = config.parse(text, [surface.STAGE])["surface"].hints
     assert hints.near == ((10.0, 20.5),) and hints.light == 90 and hints.far == () and not hints.convex_mask
+
+
+def ripples(xy):
+    """Height gradient of folds hardly wider than instances are apart."""
+    return np.stack((0.9 * np.cos(xy[..., 0] / 9), 0.3 * np.sin(xy[..., 1] / 40)), -1)
+
+
+def test_a_surface_as_rough_as_nodes_are_apart_is_looked_at_more_closely(monkeypatch):
+    xy = jittered(SHAPE, 9)
+    n = tensors.normals(ripples(xy))
+    light = 0.5 + 0.4 * n[:, 2] - 0.35 * n[:, 1] + 0.25 * n[:, 0]
+    parts = instances_of((xy, ripples(xy)), noise=0.01, light=light)
+    params = surface.Params(finalists=1, camera="orthographic", nodes=500)
+    close = surface.run({"image": image(), "frontal": parts}, params)
+    monkeypatch.setattr(surface, "ROUGH", 0.0)
+    far = surface.run({"image": image(), "frontal": parts}, params)
+    off = [np.median(angles(out, ripples)) for out in (close, far)]
+    assert off[0] < 0.9 * off[1] and close["energy"] != far["energy"]
