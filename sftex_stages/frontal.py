@@ -244,8 +244,8 @@ def finish(
     gap, spread = constraint_gap(tensor, own)
     inflation, scale_var = noise_split(gap, spread, inlier)
     turn = turn_variance(tensor, own * inflation)
-    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, turn, circular)
-    common = common_covariance(frames_, where, scale, order, metric_cov)
+    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, turn, circular, upgrade.relief)
+    common = common_covariance(frames_, where, scale, order, metric_cov, upgrade.relief)
     cov = own * inflation + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
     projected, left, chi2 = project_tensors(tensor, cov)
     # each instance's own scale: the trend with the whole departure from it, its upward bias where λ1 ≈ λ2 taken off

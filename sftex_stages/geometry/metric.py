@@ -15,26 +15,84 @@ Array = NDArray[np.floating]
 _NOISY = 0.15  # anisotropy below which the larger singular value is biased by noise
 _STILL = 1e-5  # a step that changes no normal
 _TREND_SIGMA = 0.1  # prior of each coefficient of log s over the image: a tenth is a strong perspective
+_RELIEFS = (0.03, 0.1, 0.3, 1.0)  # amplitudes of log s, at the longest wave, that are tried
+_WAVES = 6  # half waves of log s over the image, at most
+_QUIET = 0.008  # log s that stays so near to its trend has no relief in it
+_RELIEF_GAIN = 5.0  # nats that relief must bring: instances' errors are not independent
+_STUDENT = 4.0  # freedom of the noise in that
 
 
 class Upgrade(NamedTuple):
     """Result of `metric_upgrade`."""
 
     gram: Array  # (2, 2) M = A Aᵀ
-    trend: Array  # (5,) coefficients of log s over (x, y, x², xy, y²)
+    trend: Array  # (K,) coefficients of log s over the columns of `trend_basis`
     log_scale: Array  # (N,) log s at the instances
     residual: float  # robust standard deviation of log σ_max − log s over instances that inform it
+    relief: float  # amplitude of the waves in log s; 0: it follows the polynomial alone
 
 
-def trend_basis(where: Array, order: int = 2) -> Array:
-    """Columns x, y, x², xy, y² of normalised positions (N, 2) in [−1, 1]: (N, 5); order 0 or 1 zeroes the rest."""
+def trend_basis(where: Array, order: int = 2, relief: float = 0.0) -> Array:
+    """Columns x, y, x², xy, y² of normalised positions (N, 2) in [−1, 1]: (N, 5); order 0 or 1 zeroes the rest.
+
+    With `relief` cosine waves besides, (N, K): what perspective adds where the surface stands out or lies back. They are scaled
+    to one prior with the others, their amplitudes as those of a Brownian surface (wave number to the power −3/2).
+    """
     x, y = where[:, 0], where[:, 1]
     columns = np.stack([x, y, x * x, x * y, y * y], -1)
     if order < 2:
         columns[:, 2:] = 0.0
     if order < 1:
         columns[:] = 0.0
-    return columns
+    if relief == 0:
+        return columns
+    i, j = np.mgrid[0 : _WAVES + 1, 0 : _WAVES + 1].reshape(2, -1)
+    k = np.hypot(i, j)
+    i, j, k = (v[(k > 0) & (k <= _WAVES)] for v in (i, j, k))
+    waves = np.cos(np.pi / 2 * i * (x[:, None] + 1)) * np.cos(np.pi / 2 * j * (y[:, None] + 1))
+    return np.concatenate([columns, waves * (relief / _TREND_SIGMA * k**-1.5)], 1)
+
+
+def find_relief(r: Array, jac: Array, where: Array, weights: Array, order: int) -> tuple[float, float]:
+    """Amplitude of the waves in log s of greatest evidence, 0 if none is worth it, and the noise that is left beside them.
+
+    `r` (N,): log σ_max − log s of a fit without waves, `jac` (N, F) its derivatives by M, `weights` (N,) in 0…1. Coefficients
+    are integrated out, in the eigenbasis of their information; Gaussian noise, once the richest fit has told the outliers.
+    """
+    say = weights * _inlying(r, jac, where, weights, order)
+    total, best, first = float(say.sum()), (-np.inf, 0.0, 0.0), -np.inf
+    for relief in (0.0, *_RELIEFS):
+        basis = _scaled(jac, where, order, relief)
+        values, vectors = np.linalg.eigh(basis.T @ (say[:, None] * basis))
+        values, seen = np.maximum(values, 0)[:, None], ((say * r) @ basis @ vectors)[:, None] ** 2
+        variance = np.geomspace(1e-3, 0.3, 40) ** 2
+        fit = (say @ r**2 - (seen / (values + variance)).sum(0)) / variance
+        evidence = -0.5 * (fit + np.log1p(values / variance).sum(0) + total * np.log(variance))
+        k = int(evidence.argmax())
+        first = max(first, evidence[k]) if relief == 0 else first
+        if relief == 0 or evidence[k] > max(best[0], first + _RELIEF_GAIN):
+            best = (float(evidence[k]), relief, float(np.sqrt(variance[k])))
+    return best[1:]
+
+
+def _scaled(jac: Array, where: Array, order: int, relief: float) -> Array:
+    """Columns (N, F + K) of M, next to free, and of log s, all scaled to unit priors."""
+    return np.concatenate([10 * jac, _TREND_SIGMA * trend_basis(where, order, relief)], 1)
+
+
+def _inlying(r: Array, jac: Array, where: Array, weights: Array, order: int) -> Array:
+    """Student weights (N,) of residuals against the richest fit."""
+    basis, left = _scaled(jac, where, order, _RELIEFS[-1]), r
+    say, taken = np.ones(len(r)), 0.0
+    for _ in range(4):
+        heavy = weights * say
+        variance = max(_weighted_mad(left, weights), 1e-3) ** 2 * heavy.sum() / max(heavy.sum() - taken, 0.1 * heavy.sum())
+        say = (_STUDENT + 1) / (_STUDENT + left**2 / variance)
+        information = basis.T @ ((weights * say)[:, None] * basis) / variance
+        inverse = np.linalg.inv(information + np.eye(basis.shape[1]))
+        left = r - basis @ (inverse @ (basis.T @ (weights * say * r))) / variance
+        taken = float(basis.shape[1] - np.trace(inverse))
+    return say
 
 
 def leading_eigenpair(tensors: Array) -> tuple[Array, Array, Array]:
@@ -95,8 +153,8 @@ def metric_upgrade(
     Robust Gauss–Newton on log σ_max(G_i A) − log s(x_i) in the three entries of M and the trend; s is 1 at the centre
     of `where` (N, 2) in [−1, 1]. Instances that are nearly frontal count little: there the larger of two equal and
     noisy singular values is biased upward. Several starts, and the lowest robust cost wins; `warm` says that the frames
-    are nearly metric already. For a circular element its M up to size is given by `circle` (`circle_metric`): equal major
-    axes then fix the size alone.
+    are nearly metric already. Where what is left follows the place, log s gets waves as well (`find_relief`). For a circular
+    element its M up to size is given by `circle` (`circle_metric`): equal major axes then fix the size alone.
     """
     base = float(np.sqrt(np.median(leading_eigenpair(frames @ np.swapaxes(frames, 1, 2))[0])))
     g = frames / base
@@ -119,8 +177,15 @@ def metric_upgrade(
             best = solved
     assert best is not None
     _, gram, trend, residuals = best
-    spread_ = _weighted_mad(residuals, weights * _informs(g, gram))
-    return Upgrade(gram / base**2, trend, basis @ trend, spread_)
+    spread_, relief = _weighted_mad(residuals, weights * _informs(g, gram)), 0.0
+    if order > 0 and spread_ > _QUIET:
+        _, jac, w = _look(gram_lift(g), gram[[0, 0, 1], [0, 1, 1]], basis @ trend, weights)
+        relief, noise = find_relief(residuals, jac @ shape.T, where, w, order)
+    if relief > 0:
+        basis = trend_basis(where, order, relief)
+        _, gram, trend, residuals = _refine(g, basis, weights, gram, shape, steps, noise)
+        spread_ = max(_weighted_mad(residuals, weights * _informs(g, gram)), noise)
+    return Upgrade(gram / base**2, trend, basis @ trend, spread_, relief)
 
 
 def _informs(g: Array, gram: Array) -> Array:
@@ -136,7 +201,10 @@ def _weighted_mad(values: Array, weights: Array) -> float:
     return float(1.4826 * np.abs(values)[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
 
 
-def _refine(g: Array, basis: Array, weights: Array, gram: Array, shape: Array, steps: int) -> tuple[float, Array, Array, Array]:
+def _refine(
+    g: Array, basis: Array, weights: Array, gram: Array, shape: Array, steps: int, noise: float = 3e-3
+) -> tuple[float, Array, Array, Array]:
+    """(log of the residuals' spread, M, trend, residuals) from the start `gram`; `noise` is the least spread assumed."""
     lift = gram_lift(g)
     m = np.array([gram[0, 0], gram[0, 1], gram[1, 1]])
     trend = np.zeros(basis.shape[1])
@@ -144,23 +212,14 @@ def _refine(g: Array, basis: Array, weights: Array, gram: Array, shape: Array, s
     prior = np.r_[np.full(free, 1e-6), np.full(len(trend), 1 / _TREND_SIGMA**2)]
 
     def look(m: Array, trend: Array) -> tuple[Array, Array, Array]:
-        """Residuals (N,), their derivatives by m (N, 3), and the instances' weights (N,)."""
-        xx, xy, yy = (lift @ m).T  # of G M Gᵀ
-        half = (xx - yy) / 2
-        radius = np.maximum(np.sqrt(half**2 + xy**2), 1e-12)
-        l1 = np.maximum((xx + yy) / 2 + radius, 1e-9)
-        cos, sin = half / radius, xy / radius  # of twice the leading direction's angle
-        squares = np.stack([(1 + cos) / 2, sin, (1 - cos) / 2], -1)
-        jac = (squares[:, None, :] @ lift)[:, 0] / (2 * l1[:, None])
-        kappa2 = np.minimum(2 * radius / l1, 1.0) ** 2
-        return 0.5 * np.log(l1) - basis @ trend, jac, weights * (kappa2 / (kappa2 + _NOISY**2) + 0.02)
+        return _look(lift, m, basis @ trend, weights)
 
     def cost(r: Array, w: Array, scale: float) -> float:
         return float(w @ np.log1p((r / scale) ** 2) / w.sum())
 
     r, jac, w = look(m, trend)
     for _ in range(steps):
-        scale = max(_weighted_mad(r, w), 3e-3)
+        scale = max(_weighted_mad(r, w), noise)
         robust = w / (1 + (r / (2 * scale)) ** 2)
         full = np.concatenate([jac @ shape.T, -basis], 1)
         normal = full.T @ (robust[:, None] * full) / scale**2 + np.diag(prior)
@@ -186,6 +245,19 @@ def _refine(g: Array, basis: Array, weights: Array, gram: Array, shape: Array, s
     return float(np.log(max(_weighted_mad(r, w), 1e-4))), np.array([[m[0], m[1]], [m[1], m[2]]]), trend, r
 
 
+def _look(lift: Array, m: Array, log_scale: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Residuals (N,) log σ_max − log s, their derivatives by m (N, 3), the instances' weights (N,); `lift` of the frames."""
+    xx, xy, yy = (lift @ m).T  # of G M Gᵀ
+    half = (xx - yy) / 2
+    radius = np.maximum(np.sqrt(half**2 + xy**2), 1e-12)
+    l1 = np.maximum((xx + yy) / 2 + radius, 1e-9)
+    cos, sin = half / radius, xy / radius  # of twice the leading direction's angle
+    squares = np.stack([(1 + cos) / 2, sin, (1 - cos) / 2], -1)
+    jac = (squares[:, None, :] @ lift)[:, 0] / (2 * l1[:, None])
+    kappa2 = np.minimum(2 * radius / l1, 1.0) ** 2
+    return 0.5 * np.log(l1) - log_scale, jac, weights * (kappa2 / (kappa2 + _NOISY**2) + 0.02)
+
+
 def _smallest(m: Array) -> float:
     """Smaller eigenvalue of ((m1, m2), (m2, m3))."""
     return float((m[0] + m[2]) / 2 - np.hypot((m[0] - m[2]) / 2, m[1]))
@@ -199,8 +271,9 @@ def metric_covariance(
     residual: float,
     turn: Array | float = 0.0,
     circular: bool = False,
+    relief: float = 0.0,
 ) -> Array:
-    """Covariance (8, 8) of (M11, M12, M22, trend) around M = I, for frames (N, 2, 2) that are metric already.
+    """Covariance (3 + K, 3 + K) of (M11, M12, M22, trend) around M = I, for frames (N, 2, 2) that are metric already.
 
     `residual` is the standard deviation of one instance's log σ_max, `turn` (N,) the variance (rad²) of the direction that
     keeps its length (`turn_variance`): directions that differ by their noise alone are one direction. Where all instances
@@ -209,14 +282,15 @@ def metric_covariance(
     l1, _, u = leading_eigenpair(frames @ np.swapaxes(frames, -1, -2))
     v = np.einsum("nji,nj->ni", frames, u) / np.sqrt(np.maximum(l1, 1e-9))[:, None]
     squares = np.stack([v[:, 0] ** 2, 2 * v[:, 0] * v[:, 1], v[:, 1] ** 2], -1)
-    full = np.concatenate([squares / 2, -trend_basis(where, order)], 1)
+    full = np.concatenate([squares / 2, -trend_basis(where, order, relief)], 1)
     w = weights * _informs(frames, np.eye(2))
     effective = w.sum() ** 2 / max((w**2).sum(), 1e-12)
     # instances of one cluster share errors (a domain that is not flat, blur that goes with slant): a quarter of them count
     variance = max(residual, 2e-3) ** 2 * 4 * effective / max(effective - 3, 0.5)
     # a circular element has one freedom, its size
-    basis = np.eye(8) if not circular else np.vstack([[1.0, 0, 1, 0, 0, 0, 0, 0], np.eye(8)[3:]])
-    prior = np.diag(np.r_[np.full(len(basis) - 5, 1.0), np.full(5, 1 / _TREND_SIGMA**2)])
+    size, trends = full.shape[1], full.shape[1] - 3
+    basis = np.eye(size) if not circular else np.vstack([np.r_[1.0, 0, 1, np.zeros(trends)], np.eye(size)[3:]])
+    prior = np.diag(np.r_[np.full(len(basis) - trends, 1.0), np.full(trends, 1 / _TREND_SIGMA**2)])
     information = full.T @ (w[:, None] * full)
     # noise of v makes its directions seem to differ: what it adds to their scatter is taken off (errors in variables)
     slope = np.stack([-v[:, 0] * v[:, 1], v[:, 0] ** 2 - v[:, 1] ** 2, v[:, 0] * v[:, 1]], -1)
@@ -234,11 +308,11 @@ def turn_variance(tensor: Array, cov: Array) -> Array:
     return np.minimum(variance / np.maximum((l1 - l2) ** 2, 1e-12), 0.5)
 
 
-def common_covariance(frames: Array, where: Array, scale: Array, order: int, cov: Array) -> Array:
-    """What an uncertain M and trend add to the covariances (N, 3, 3) of G M Gᵀ/s²; frames metric, `cov` (8, 8)."""
+def common_covariance(frames: Array, where: Array, scale: Array, order: int, cov: Array, relief: float = 0.0) -> Array:
+    """What an uncertain M and trend add to the covariances (N, 3, 3) of G M Gᵀ/s²; frames metric, `cov` (3 + K, 3 + K)."""
     g = frames / scale[:, None, None]
     tensor = np.stack([(g[:, 0] ** 2).sum(-1), (g[:, 0] * g[:, 1]).sum(-1), (g[:, 1] ** 2).sum(-1)], -1)
-    jac = np.concatenate([gram_lift(g), -2 * tensor[:, :, None] * trend_basis(where, order)[:, None, :]], 2)
+    jac = np.concatenate([gram_lift(g), -2 * tensor[:, :, None] * trend_basis(where, order, relief)[:, None, :]], 2)
     return jac @ cov @ np.swapaxes(jac, 1, 2)
 
 
