@@ -27,9 +27,18 @@ class Params(StageParams):
     seed: int = Field(0, ge=0, description="seed of k-means")
 
 
+_AT_LEAST = 100  # clusters of interest points, where that leaves each this many:
+_SMALL = 25
+
+
 def number_of_clusters(points: int, per_cluster: float, params: Params) -> int:
-    """k for `points` descriptors of one kind."""
+    """k for `points` descriptors of one kind.
+
+    A sparse print has some tens of copies of each element: clusters as large as those of a dense print would mix them.
+    """
     wanted = params.clusters if params.clusters is not None else round(points / per_cluster)
+    if params.clusters is None and per_cluster == params.points_per_cluster:
+        wanted = max(wanted, min(_AT_LEAST, points // _SMALL))
     return int(np.clip(wanted, 1, max(1, points // 3)))
 
 

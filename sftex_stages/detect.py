@@ -30,15 +30,48 @@ class Params(StageParams):
     max_keypoints: int = Field(60_000, ge=10, description="the strongest are kept")
 
 
-def encode(rgb: Array) -> Array:
-    """Display-encoded grey (H, W) uint8 of linear `rgb` (H, W, 3), white at the image's 99.5th percentile."""
-    luminance = rgb @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_FAINT = 0.15  # share of the best projection's contrast, as variance, below which luminance does not show a print
+_DETAIL = (1.0, 6.0)  # px; detail between these is the print's
+
+
+def encode(rgb: Array, mask: Array) -> Array:
+    """Display-encoded grey (H, W) uint8 of linear `rgb` (H, W, 3), white at the image's 99.5th percentile.
+
+    Luminance, or where that is blind to the detail within `mask` (H, W), as to red on a green as bright, the mixture of the encoded
+    channels that shows most of it, its 0.5th to 99.5th percentiles stretched over 0…255.
+    """
+    luminance = rgb @ LUMINANCE
     white = max(float(np.percentile(luminance, 99.5)), 1e-9)
     if white <= 1.0 and luminance.max() <= 1.0:
         white = 1.0 if white > 0.25 else white
-    x = np.clip(luminance / white, 0, 1)
-    coded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
-    return np.round(255 * coded).astype(np.uint8)
+    mixture = most_contrast(display(rgb / max(white, float(np.percentile(rgb, 99.5)))), mask)
+    if mixture is None:
+        return np.round(255 * display(luminance / white)).astype(np.uint8)
+    grey = display(rgb / max(white, float(np.percentile(rgb, 99.5)))) @ mixture
+    low, high = np.percentile(grey[mask], (0.5, 99.5))
+    return np.round(255 * np.clip((grey - low) / max(high - low, 1e-9), 0, 1)).astype(np.uint8)
+
+
+def display(linear: Array) -> Array:
+    """sRGB's encoding, 0…1."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
+
+
+def most_contrast(coded: Array, mask: Array) -> Array | None:
+    """Weights (3,) of the channels of `coded` (H, W, 3) whose mixture shows most detail; None while luminance shows enough."""
+    step = max(1, round(np.sqrt(coded.shape[0] * coded.shape[1] / 4e6)))
+    small = coded[: coded.shape[0] // step * step, : coded.shape[1] // step * step].astype(np.float32)
+    small = cv2.resize(small, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else small
+    detail = cv2.GaussianBlur(small, (0, 0), _DETAIL[0]) - cv2.GaussianBlur(small, (0, 0), _DETAIL[1])
+    inside = cv2.resize(mask.astype(np.uint8), detail.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
+    if inside.sum() < 10:
+        return None
+    covariance = np.cov(detail[inside].T.astype(np.float64))
+    values, vectors = np.linalg.eigh(covariance)
+    shown = LUMINANCE @ covariance @ LUMINANCE / (LUMINANCE @ LUMINANCE)
+    return None if shown >= _FAINT * values[-1] else vectors[:, -1]
 
 
 def enlarge(grey: Array, min_megapixels: float) -> tuple[Array, Array]:
@@ -95,7 +128,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """
     image = inputs["image"]
     mask = image["mask"]
-    enlarged, scale = enlarge(encode(image["rgb"]), params.min_megapixels)
+    enlarged, scale = enlarge(encode(image["rgb"], mask), params.min_megapixels)
     points = interest_points(enlarged, scale, mask, params)
     blobs = regions(enlarged, scale, mask, params)
     xy, frames, descriptors = (np.concatenate(both) for both in zip(points, blobs, strict=True))
