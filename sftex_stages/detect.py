@@ -39,7 +39,7 @@ def encode(rgb: Array, mask: Array) -> Array:
     """Display-encoded grey (H, W) uint8 of linear `rgb` (H, W, 3), white at the image's 99.5th percentile.
 
     Luminance, or where that is blind to the detail within `mask` (H, W), as to red on a green as bright, the mixture of the encoded
-    channels that shows most of it, its 0.5th to 99.5th percentiles stretched over 0…255.
+    channels that shows most of it.
     """
     luminance = rgb @ LUMINANCE
     white = max(float(np.percentile(luminance, 99.5)), 1e-9)
@@ -50,7 +50,7 @@ def encode(rgb: Array, mask: Array) -> Array:
         return np.round(255 * display(luminance / white)).astype(np.uint8)
     grey = display(rgb / max(white, float(np.percentile(rgb, 99.5)))) @ mixture
     low, high = np.percentile(grey[mask], (0.5, 99.5))
-    return np.round(255 * np.clip((grey - low) / max(high - low, 1e-9), 0, 1)).astype(np.uint8)
+    return np.round(255 * np.clip(0.5 + (grey - (low + high) / 2) / max(high - low, 1), 0, 1)).astype(np.uint8)
 
 
 def display(linear: Array) -> Array:
