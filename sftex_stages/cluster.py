@@ -21,24 +21,22 @@ class Params(StageParams):
 
     clusters: int | None = Field(None, ge=1, le=5000, description="clusters of points and of regions; null: from their numbers")
     points_per_cluster: float = Field(80.0, ge=3, description="sets the number of clusters when it is not given")
+    min_clusters: int = Field(100, ge=1, description="clusters of points are no fewer, where 25 points are left to each")
     regions_per_cluster: float = Field(150.0, ge=3, description="the same for regions, whose frames are affine already")
     max_distance: float = Field(1.6, gt=0, description="members farther from the centre, in median distances, are left out")
     max_scale_ratio: float = Field(2.0, gt=1, description="members whose size differs from the median by more are left out")
     seed: int = Field(0, ge=0, description="seed of k-means")
 
 
-_AT_LEAST = 100  # clusters of interest points, where that leaves each this many:
-_SMALL = 25
+_FEW = 25  # copies of an element that a sparse print still has, or so
 
 
-def number_of_clusters(points: int, per_cluster: float, params: Params) -> int:
-    """k for `points` descriptors of one kind.
+def number_of_clusters(points: int, per_cluster: float, params: Params, fewest: int = 1) -> int:
+    """k for `points` descriptors of one kind; `fewest` if it leaves enough of them to each.
 
-    A sparse print has some tens of copies of each element: clusters as large as those of a dense print would mix them.
+    Sparse prints have some tens of copies of each element: clusters as large as those of a dense print would mix elements.
     """
-    wanted = params.clusters if params.clusters is not None else round(points / per_cluster)
-    if params.clusters is None and per_cluster == params.points_per_cluster:
-        wanted = max(wanted, min(_AT_LEAST, points // _SMALL))
+    wanted = max(round(points / per_cluster), min(fewest, points // _FEW)) if params.clusters is None else params.clusters
     return int(np.clip(wanted, 1, max(1, points // 3)))
 
 
@@ -51,11 +49,11 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     size = np.log(np.sqrt(np.abs(np.linalg.det(detect["frame"].astype(np.float64)))))
     label = np.full(len(kind), -1, np.int32)
     count = 0
-    for which, share in ((0, params.points_per_cluster), (1, params.regions_per_cluster)):
+    for which, share, fewest in ((0, params.points_per_cluster, params.min_clusters), (1, params.regions_per_cluster, 1)):
         rows = np.flatnonzero(kind == which)
         if len(rows) < 3:
             continue
-        k = number_of_clusters(len(rows), share, params)
+        k = number_of_clusters(len(rows), share, params, fewest)
         descriptors = detect["descriptor"][rows].astype(np.float32)
         means = KMeans(k, n_init=1, max_iter=60, random_state=params.seed, algorithm="lloyd").fit(descriptors)
         distance = np.linalg.norm(descriptors - means.cluster_centers_[means.labels_], axis=1)

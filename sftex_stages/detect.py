@@ -38,8 +38,8 @@ _DETAIL = (1.0, 6.0)  # px; detail between these is the print's
 def encode(rgb: Array, mask: Array) -> Array:
     """Display-encoded grey (H, W) uint8 of linear `rgb` (H, W, 3), white at the image's 99.5th percentile.
 
-    Luminance, or where that is blind to the detail within `mask` (H, W), as to red on a green as bright, the mixture of the encoded
-    channels that shows most of it.
+    Luminance, or where that is blind to the detail within `mask` (H, W), as to red on a green as bright, the mixture of the
+    encoded channels that shows most of it.
     """
     luminance = rgb @ LUMINANCE
     white = max(float(np.percentile(luminance, 99.5)), 1e-9)

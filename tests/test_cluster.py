@@ -38,7 +38,7 @@ def run(detect, **params):
 
 def test_groups_far_apart_become_clusters(rng):
     detect, group = planted(rng)
-    got = run(detect, points_per_cluster=40, regions_per_cluster=30)
+    got = run(detect, points_per_cluster=40, regions_per_cluster=30, min_clusters=1)
     label = got["label"]
     assert label.dtype == np.int32 and label.shape == group.shape
     assert got["count"].dtype == np.int64 and got["count"].shape == () and got["count"] == 5
@@ -50,6 +50,12 @@ def test_groups_far_apart_become_clusters(rng):
 @pytest.mark.parametrize("points, per, expected", [(800, 80, 10), (1000, 80, 12), (30, 80, 1), (10, 3, 3), (0, 80, 1)])
 def test_number_of_clusters_follows_the_number_of_points(points, per, expected):
     assert number_of_clusters(points, per, Params()) == expected
+
+
+@pytest.mark.parametrize("points, expected", [(20000, 250), (5000, 100), (1500, 60), (20, 1)])
+def test_few_points_make_smaller_clusters(points, expected):
+    assert number_of_clusters(points, 80, Params(), 100) == expected
+    assert number_of_clusters(points, 80, Params(clusters=5), 100) == 5
 
 
 def test_number_of_clusters_given_holds_for_each_kind_but_leaves_three_members_each(rng):

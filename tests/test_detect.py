@@ -33,6 +33,10 @@ def image(rgb):
     return {"rgb": rgb, "mask": np.ones(rgb.shape[:2], bool)}
 
 
+def encoded(rgb):
+    return detect.encode(rgb, np.ones(rgb.shape[:2], bool))
+
+
 def test_arrays_are_those_of_the_contract(found):
     n = len(found["xy"])
     kinds = {name: (array.dtype.name, array.shape) for name, array in found.items()}
@@ -163,7 +167,7 @@ def test_brightness_as_stored_does_not_matter(scene):
 def test_encoding_is_srgb_and_monotonic():
     grey = np.linspace(0, 1, 256)
     rgb = np.repeat(grey[None, :, None], 3, 2).astype(np.float32)
-    coded = detect.encode(rgb)[0]
+    coded = encoded(rgb)[0]
     assert coded[0] == 0 and coded[-1] == 255 and (np.diff(coded.astype(int)) >= 0).all()
     assert coded[55] == pytest.approx(255 * (1.055 * grey[55] ** (1 / 2.4) - 0.055), abs=0.6)
 
@@ -171,3 +175,32 @@ def test_encoding_is_srgb_and_monotonic():
 def test_glyph_of_the_synthetic_scene_is_paper_beyond_its_radius():
     ring = np.stack([np.cos(t := np.linspace(0, 6.3, 50)), np.sin(t)], -1)
     assert np.abs(glyph(1.1 * ring) - 0.8).max() < 0.01
+
+
+def two_colours(colour, ground=(0.5, 0.2, 0.1), size=160):
+    """Linear rgb of round spots of `colour` on `ground`, under light that falls off to the right."""
+    y, x = np.mgrid[0:size, 0:size]
+    spot = (np.hypot(x % 32 - 15.5, y % 32 - 15.5) < 8.0)[..., None]
+    light = np.linspace(1, 0.5, size)[:, None]
+    return (np.where(spot, colour, ground) * light).astype(np.float32)
+
+
+def test_print_of_the_grounds_own_luminance_is_seen_by_its_colour():
+    ground = np.array([0.5, 0.2, 0.1])
+    blue = np.array([0.1, 0.3, 0.5])
+    blue *= ground @ detect.LUMINANCE / (blue @ detect.LUMINANCE)
+    rgb = two_colours(blue)
+    assert np.ptp(rgb @ detect.LUMINANCE, axis=0).max() < 1e-6  # no luminance photograph would show it
+    mixture = detect.most_contrast(detect.display(rgb), np.ones((160, 160), bool))
+    assert mixture[0] * mixture[2] < 0 and np.linalg.norm(mixture) == pytest.approx(1)
+    found = detect.run({"image": image(rgb)}, detect.Params())
+    inner = found["xy"][found["kind"] == 1]
+    centres = np.stack(np.meshgrid(np.arange(15.5, 160, 32), np.arange(15.5, 160, 32)), -1).reshape(-1, 2)
+    assert (np.linalg.norm(centres[:, None] - inner, axis=-1).min(1) < 1).mean() > 0.9
+
+
+def test_luminance_is_kept_where_it_shows_the_print():
+    for rgb in (two_colours([0.1, 0.05, 0.05]), two_colours([0.1, 0.1, 0.1]), two_colours([0.2] * 3, [0.6] * 3)):
+        assert detect.most_contrast(detect.display(rgb), np.ones((160, 160), bool)) is None
+    assert detect.most_contrast(np.zeros((20, 20, 3)), np.ones((20, 20), bool)) is None
+    assert detect.most_contrast(two_colours([0.1] * 3), np.zeros((160, 160), bool)) is None

@@ -1,8 +1,8 @@
 """Random scenes with their exact truth, for looking at what nothing was tuned to: ``python -m sftex_stages.bench.scenes``.
 
 A scene is a surface Z(X, Y), a print of elements on it, a light and a camera, all drawn by seed. Every pixel's sight line is
-met with the surface, the albedo there looked up in the element that lies there, flat on the tangent plane at its centre. Frame and files as
-`data/examples/README.md` has them. The camera of perspective scenes is at (c_x, c_y, f).
+met with the surface, and the albedo looked up in the element that lies there, flat on the tangent plane at its centre. Frame
+and files are those of `data/examples/README.md`. The camera of perspective scenes is at (c_x, c_y, f).
 """
 
 import argparse

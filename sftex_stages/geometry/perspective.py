@@ -153,6 +153,19 @@ class Sizes:
         return cost[0] - cost[1]
 
 
+def summit(found: dict[float, float]) -> float:
+    """Where the parabola, over log x, through the greatest of values {x: value} and its neighbours has its top."""
+    x = np.log(sorted(found))
+    y = np.array([found[k] for k in sorted(found)])
+    k = int(y.argmax())
+    if not 0 < k < len(x) - 1:
+        return float(np.exp(x[k]))
+    left, right = x[k] - x[k - 1], x[k + 1] - x[k]
+    before, after = (y[k] - y[k - 1]) / left, (y[k] - y[k + 1]) / right
+    move = (before * right - after * left) / (2 * (before + after)) if before + after > 0 else 0.0
+    return float(np.exp(x[k] + move))
+
+
 @dataclass(frozen=True)
 class Choice:
     """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind)."""
@@ -223,7 +236,7 @@ def choose(
                 if BENDS[0] <= k <= BENDS[1] and not any(abs(np.log(k / j)) < 0.01 for j in found):
                     found[k] = evidence(k / size, np.sign(sign))
             ratio = ratio if max(found, key=lambda k: found[k]) != best else ratio**0.5
-        bend = max(found, key=lambda k: found[k]) / size
+        bend = summit(found) / size
         # Tensors alone may like any bend, toward rims above all: the sizes must say by themselves that they follow depth.
         bent, _, change = flatten_tensors(Camera(centre, bend), xy, w, covariance)
         own = max(found.values()) - evidence(bend, 1.0, False) - sizes.unrelated(xy, bent, change)

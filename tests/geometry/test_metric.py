@@ -9,6 +9,7 @@ from sftex_stages.geometry.metric import (
     circle_metric,
     common_covariance,
     constraint_gap,
+    find_relief,
     gram_lift,
     leading_bias,
     leading_eigenpair,
@@ -125,6 +126,42 @@ def test_linear_trend_of_scale_is_recovered_with_the_frame(rng):
     assert got.log_scale == pytest.approx(where @ slope, abs=3e-4)
     assert error_of(got.gram, a) < 1e-3
     assert upgrade_of(frames, where, order=0).residual > 0.03
+
+
+def waved(where):
+    """Log scale (N,) over a relief, up to a tenth."""
+    return 0.1 * np.sin(3 * where[:, 0] + 1) * np.cos(2.5 * where[:, 1])
+
+
+def test_scale_that_follows_a_relief_is_recovered_with_the_frame(rng):
+    where = rng.uniform(-1, 1, (120, 2))
+    a, scale = affine_map(rng), waved(where)
+    frames = transforms(rng, 120, 5, 65, np.exp(scale)) @ np.linalg.inv(a)
+    frames = frames * np.exp(0.003 * rng.normal(size=(120, 1, 1)))
+    got = upgrade_of(frames, where, order=1)
+    assert got.relief > 0 and got.residual < 0.01
+    error = got.log_scale - scale
+    assert (error - np.median(error)).std() < 0.01  # a constant is the frame's
+    assert error_of(got.gram / np.sqrt(np.linalg.det(got.gram)), a / np.sqrt(np.linalg.det(a))) < 0.02
+
+
+def test_scatter_that_does_not_follow_the_place_is_no_relief(rng):
+    where = rng.uniform(-1, 1, (60, 2))
+    for noise in (0.0, 0.01, 0.05):
+        frames = transforms(rng, 60, 5, 65, np.exp(0.1 * where[:, 0] + noise * rng.normal(size=60)))
+        assert upgrade_of(frames, where, order=1).relief == 0
+    frames = transforms(rng, 60, 5, 65, np.exp(waved(where)))
+    assert upgrade_of(frames, where, order=0).relief == 0  # scale that is not to vary does not
+
+
+def test_noise_beside_the_relief_counts_what_the_waves_take(rng):
+    where, ratio = rng.uniform(-1, 1, (80, 2)), []
+    for _ in range(8):
+        r = waved(where) + 0.02 * rng.normal(size=80)
+        relief, noise = find_relief(r, np.zeros((80, 1)), where, np.ones(80), 1)
+        assert relief > 0
+        ratio.append(noise / 0.02)
+    assert 0.7 < np.mean(ratio) < 1.1  # large residuals count less
 
 
 def test_a_fifth_of_gross_outliers_does_no_harm(rng):
@@ -271,6 +308,14 @@ def test_gram_lift_is_the_congruence(rng):
     lifted = np.einsum("nij,nj->ni", gram_lift(g), np.stack([e[:, 0, 0], e[:, 0, 1], e[:, 1, 1]], -1))
     product = g @ e @ np.swapaxes(g, 1, 2)
     assert lifted == pytest.approx(np.stack([product[:, 0, 0], product[:, 0, 1], product[:, 1, 1]], -1))
+
+
+def test_waves_are_scaled_to_the_prior_of_the_trend():
+    where = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    plain, waved = trend_basis(where, 1), trend_basis(where, 1, 0.3)
+    assert (waved[:, :5] == plain).all() and waved.shape[1] > 30
+    assert trend_basis(where, 1, 0.6)[:, 5:] == pytest.approx(2 * waved[:, 5:])
+    assert np.abs(waved[:, 5:]).max() <= 0.3 / 0.1 + 1e-12
 
 
 def test_common_covariance_against_finite_differences(rng):

@@ -147,3 +147,11 @@ def test_heights_are_integrated_out_as_a_dense_gaussian():
     flat = columns @ np.diag(height.spread**2) @ columns.T + np.diag(1 / height.precision)
     expected = -0.5 * (height.value @ np.linalg.solve(flat, height.value) + np.linalg.slogdet(2 * np.pi * flat)[1])
     assert height.unrelated() == pytest.approx(expected, rel=1e-9)
+
+
+def test_summit_of_samples_of_a_parabola_is_its_own():
+    top = 0.37
+    values = {k: 5 - 3 * np.log(k / top) ** 2 for k in (0.1, 0.3, 0.45, 0.8)}
+    assert perspective.summit(values) == pytest.approx(top, rel=1e-9)
+    rising = {k: k for k in (0.1, 0.2, 0.3)}
+    assert perspective.summit(rising) == 0.3  # nothing beyond was looked at
