@@ -9,32 +9,18 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from .engine.stage import Arrays, Stage, StageParams
-from .geometry.imaging import normal_of_tensor, tensor_of
-from .geometry.metric import (
-    common_covariance,
-    constraint_gap,
-    leading_bias,
-    metric_covariance,
-    noise_split,
-    project_tensors,
-    turn_variance,
-)
-from .geometry.registration import channel_gains, patch_grid, register, sample
+from .geometry.registration import patch_grid, register, sample
 from .geometry.texton import (
     Estimate,
     Settings,
     estimate_texton,
     independent_samples,
-    information_centre,
     posterior,
-    strain_covariance,
     strain_error,
-    tensor_covariance,
-    upgrade_texton,
     weighted_contrast,
     weighted_mean,
-    with_tensor,
 )
+from .geometry.views import Views, calibrate, measure, unique
 
 Array = NDArray[np.floating]
 Indices = NDArray[np.integer]
@@ -98,7 +84,6 @@ def level_image(rgb: Array, level: int) -> Array:
 
 def empty(reason: str) -> Arrays:
     """The artefact of a texton that could not be estimated."""
-    none = np.zeros((0,), np.float32)
     return {
         "usable": np.array(False),
         "reason": np.array(reason),
@@ -112,6 +97,24 @@ def empty(reason: str) -> Arrays:
         "strain_error": np.array(np.nan, np.float32),
         "circular": np.array(False),
         "blur": np.array(np.nan, np.float32),
+        "level": np.array(0, np.int32),
+        "noise": np.array(np.nan),
+        "prior": np.array(np.nan),
+        "spread": np.array(np.nan),
+        "mean_blur": np.zeros(3),
+        "gram": np.eye(2),
+        "trend": np.zeros(5),
+        "order": np.array(0, np.int32),
+        "inflation": np.array(np.nan),
+        "scale_variance": np.array(np.nan),
+        "gauge_cov": np.zeros((8, 8)),
+    } | no_rows()
+
+
+def no_rows() -> Arrays:
+    """The table of no instances."""
+    none = np.zeros((0,), np.float32)
+    return {
         "index": np.zeros(0, np.int32),
         "xy": np.zeros((0, 2), np.float32),
         "transform": np.zeros((0, 2, 2), np.float32),
@@ -236,40 +239,21 @@ def finish(
     if inlier.sum() < 2.5:
         return empty("its patches do not agree with their mean")
     order = params.trend_order if inlier.sum() >= 12 else 0
-    upgrade, circular = upgrade_texton(template, got.frames, where, inlier + 1e-6, order)
-    frames_ = got.frames @ np.linalg.cholesky(upgrade.gram)
-    scale = np.exp(upgrade.log_scale)
-    tensor = tensor_of(frames_, scale)
-    own = tensor_covariance(frames_, scale, strain_covariance(template, residual))
-    gap, spread = constraint_gap(tensor, own)
-    inflation, scale_var = noise_split(gap, spread, inlier)
-    turn = turn_variance(tensor, own * inflation)
-    metric_cov = metric_covariance(frames_, where, inlier + 1e-6, order, upgrade.residual, turn, circular, upgrade.relief)
-    common = common_covariance(frames_, where, scale, order, metric_cov, upgrade.relief)
-    cov = own * inflation + common + scale_var * tensor[:, :, None] * tensor[:, None, :]
-    projected, left, chi2 = project_tensors(tensor, cov)
-    # each instance's own scale: the trend with the whole departure from it, its upward bias where λ1 ≈ λ2 taken off
-    scale = scale * np.sqrt(np.clip(1.0 + gap - leading_bias(tensor, inflation * spread), 0.1, 10.0))
-    inlier = inlier * np.where(chi2 < 12.0, 1.0, np.exp(-0.5 * (chi2 - 12.0)))
-    transform = with_tensor(frames_, projected, scale)
-    normal = normal_of_tensor(projected)
-    sigma = normal_sigma(normal, left)
-    centre = got.xy + transform @ information_centre(template)
-    inlier = inlier * unique(got.xy, residual, transform, template)
-    seen = sample(image, got.xy, got.frames, template.points)
-    light = channel_gains(template, seen, got.frames, got.variation)
+    gauge, metric_residual, circular = calibrate(template, got.frames, where, residual, inlier, order)
+    views = measure(image, template, gauge, got, where)
+    inlier = inlier * views.credit * unique(got.xy, residual, views.transform, template)
     good = inlier > 0.8
-    metric_error = float(np.sqrt(np.linalg.eigvalsh(metric_cov[:3, :3])[-1]))
+    metric_error = float(np.sqrt(np.linalg.eigvalsh(gauge.covariance[:3, :3])[-1]))
     least = max(float(np.median(residual[good])) if good.any() else 0.0, params.noise_floor**2 * contrast2)
     weakest = strain_error(template, least)
     reason = ""
-    typical = float(np.median(sigma[good])) if good.any() else np.inf
+    typical = float(np.median(views.normal_sigma[good])) if good.any() else np.inf
     if good.sum() < 4:
         reason = f"only {int(good.sum())} instances agree with it"
     elif good.sum() < min(_ENOUGH, params.min_share * len(members)):
         reason = f"only {int(good.sum())} of {len(members)} members agree with it, as few as chance brings together"
-    elif upgrade.residual > params.max_metric_residual * (_CIRCLE_SLACK if circular else 1.0):
-        reason = f"its instances are no views of one flat element (metric residual {upgrade.residual:.3f})"
+    elif metric_residual > params.max_metric_residual * (_CIRCLE_SLACK if circular else 1.0):
+        reason = f"its instances are no views of one flat element (metric residual {metric_residual:.3f})"
     elif weakest > params.max_strain_error:
         reason = f"it is too plain along one direction, as an edge is, to fix slant and tilt (error {weakest:.2f})"
     elif metric_error > params.max_metric_error:
@@ -284,60 +268,44 @@ def finish(
         "spacing": np.array(texton.spacing / factor, np.float32),
         "progress": progress(image, texton),
         "progress_iterations": np.array([h[0] for h in texton.history], np.int32),
-        "metric_residual": np.array(upgrade.residual, np.float32),
+        "metric_residual": np.array(metric_residual, np.float32),
         "information": np.array(metric_error, np.float32),
         "strain_error": np.array(weakest, np.float32),
         "circular": np.array(circular),
         "blur": np.array(np.sqrt(max(template.spread - sampling_spread(factor), 0)) / factor, np.float32),
-        "index": members.astype(np.int32),
-        "xy": ((centre + 0.5) / factor - 0.5).astype(np.float32),
-        "transform": transform.astype(np.float32),
-        "scale": scale.astype(np.float32),
-        "tensor": tensor.astype(np.float32),
-        "tensor_cov": cov.astype(np.float32),
-        "log_scale_sigma": (0.5 * np.sqrt(inflation * spread)).astype(np.float32),
-        "normal": normal.astype(np.float32),
-        "normal_sigma": sigma.astype(np.float32),
-        "inlier": inlier.astype(np.float32),
-        "irradiance": got.gain.astype(np.float32),
-        "irradiance_rgb": light.astype(np.float32),
-        "irradiance_sigma": np.sqrt(residual / max(float((template.values**2).mean()), 1e-12) / samples).astype(np.float32),
+        "level": np.array(round(-np.log2(factor)), np.int32),
+        "noise": np.array(texton.noise),
+        "prior": np.array(texton.prior),
+        "spread": np.array(template.spread),
+        "mean_blur": template.mean_blur,
+        "ridge": template.ridge,
+        "gram": gauge.gram,
+        "trend": gauge.trend,
+        "order": np.array(gauge.order, np.int32),
+        "inflation": np.array(gauge.inflation),
+        "scale_variance": np.array(gauge.scale_variance),
+        "relief": np.array(gauge.relief),
+        "gauge_cov": gauge.covariance,
+    } | rows(views, members, inlier, factor)
+
+
+def rows(views: Views, index: Indices, inlier: Array, factor: float) -> Arrays:
+    """A row for each view; `index` of its point in `detect`, −1 without one. `factor`: px of its pyramid level per px."""
+    out = {
+        "xy": (views.xy + 0.5) / factor - 0.5,
+        "transform": views.transform,
+        "scale": views.scale,
+        "tensor": views.tensor,
+        "tensor_cov": views.tensor_cov,
+        "log_scale_sigma": views.log_scale_sigma,
+        "normal": views.normal,
+        "normal_sigma": views.normal_sigma,
+        "inlier": inlier,
+        "irradiance": views.light,
+        "irradiance_rgb": views.light_rgb,
+        "irradiance_sigma": views.light_sigma,
     }
-
-
-def normal_sigma(normal: Array, cov: Array) -> Array:
-    """Expected error in degrees (M,) of normals (M, 3) from the covariance of their tensors.
-
-    Along the tilt the tensor moves with 2 sin σ cos σ, across it with sin² σ: near σ = 0 both vanish, and the error is
-    the square root of the tensor's.
-    """
-    sine = np.hypot(normal[:, 0], normal[:, 1])
-    u = normal[:, :2] / np.maximum(sine, 1e-9)[:, None]
-    along = np.stack([u[:, 0] ** 2, 2 * u[:, 0] * u[:, 1], u[:, 1] ** 2], -1)
-    across = np.stack([-u[:, 0] * u[:, 1], u[:, 0] ** 2 - u[:, 1] ** 2, u[:, 0] * u[:, 1]], -1)
-    va = np.einsum("mi,mij,mj->m", along, cov, along)
-    vc = np.einsum("mi,mij,mj->m", across, cov, across)
-    cos = np.maximum(normal[:, 2], 0.1)
-    slant = np.sqrt(va) / (2 * cos * np.sqrt(sine**2 + 0.5 * np.sqrt(va)))
-    tilt = np.sqrt(vc) / np.sqrt(sine**2 + np.sqrt(vc))
-    return np.degrees(np.hypot(slant, tilt))
-
-
-def unique(xy: Array, residual: Array, transform: Array, template: Any) -> Array:
-    """1 for instances to keep, 0 for those that have slid onto a better registered one (M,)."""
-    order = np.argsort(residual)
-    keep = np.zeros(len(xy))
-    used = template.weights > 0.3 * template.weights.max()
-    radius = np.sqrt(used.sum() / np.pi)
-    size = np.sqrt(np.abs(np.linalg.det(transform))) * radius
-    taken, count = np.empty_like(xy), 0
-    for i in order:
-        apart2 = ((taken[:count] - xy[i]) ** 2).sum(1)
-        if count and apart2.min() < (0.25 * size[i]) ** 2:
-            continue
-        taken[count], count = xy[i], count + 1
-        keep[i] = 1.0
-    return keep
+    return {"index": index.astype(np.int32)} | {name: array.astype(np.float32) for name, array in out.items()}
 
 
 def progress(image: Array, texton: Estimate) -> Array:
