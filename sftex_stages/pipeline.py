@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import chart, cluster, config, detect, frontal, images, irradiance, surface
+from . import chart, cluster, config, detect, enrich, frontal, images, irradiance, surface
 from .engine.plan import Delivery, Item, Plan, Planner
 from .engine.stage import Arrays, Stage
 from .engine.store import Store, read_receipt
@@ -14,7 +14,8 @@ from .errors import StoreError
 from .results import VERSION as RESULTS_VERSION
 
 PIPELINE: tuple[Stage, ...] = (
-    images.STAGE, detect.STAGE, cluster.STAGE, frontal.STAGE, surface.STAGE, irradiance.STAGE, chart.STAGE,
+    images.STAGE, detect.STAGE, cluster.STAGE, frontal.STAGE, enrich.STAGE, surface.STAGE, irradiance.STAGE,
+    chart.STAGE,
 )  # fmt: skip
 
 

@@ -106,8 +106,8 @@ class Instances:
     log_scale: Float  # (N,) of the calibrated transforms, up to a constant a texton
 
 
-def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
-    """Members of all usable textons, one row each; `texton` is the part's number.
+def collect(frontal: list[Arrays], min_inlier: float, found: Arrays | None = None) -> Arrays:
+    """Members of all usable textons and what the search `found` of them, one row each; `texton` is the part's number.
 
     Raises
     ------
@@ -125,6 +125,8 @@ def collect(frontal: list[Arrays], min_inlier: float) -> Arrays:
         )
     rows = {name: np.concatenate([np.asarray(f[name]) for _, f in parts]) for name in names}
     rows["texton"] = np.concatenate([np.full(len(f["xy"]), k, np.int32) for k, f in parts])
+    if found is not None:
+        rows = {name: np.concatenate([array, found[name]]) for name, array in rows.items()}
     good = int((rows["inlier"] > min_inlier).sum())
     if good < 3:
         raise StageError(
@@ -152,6 +154,8 @@ def prepare(rows: Arrays, params: Params, camera: perspective.Camera | None = No
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """Height, normals, their support and uncertainty, and instances with their sign resolved.
 
+    Inputs `image`, `frontal` and, where there was a search, `enrich`.
+
     Returns
     -------
     height (H, W) px toward the camera, mean 0 (perspective: px as they are at the distance f); normals (H, W, 3) in the
@@ -178,7 +182,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     """
     mask = np.asarray(inputs["image"]["mask"], bool)
     hints = read_hints(params.hints, mask.shape)
-    rows = collect(inputs["frontal"], params.min_inlier)
+    rows = collect(inputs["frontal"], params.min_inlier, inputs.get("enrich"))
     instances = prepare(rows, params)
     used = instances.trust > 0
     box = instances.xy[used].min(0), instances.xy[used].max(0)
@@ -531,4 +535,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=7, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="surface", version=7, params=Params, run=run, inputs=("image", "frontal", "enrich"))

@@ -18,7 +18,7 @@ def test_shipped_configuration_is_the_default():
 
 def test_records_are_consistent():
     names = [stage.name for stage in pipeline.PIPELINE]
-    assert names == ["image", "detect", "cluster", "frontal", "surface", "irradiance", "chart"]
+    assert names == ["image", "detect", "cluster", "frontal", "enrich", "surface", "irradiance", "chart"]
     for number, stage in enumerate(pipeline.PIPELINE):
         assert set(stage.inputs) <= set(names[:number]), "a stage depends on earlier ones only"
         assert stage.fan_out is None or stage.fan_out in stage.inputs
