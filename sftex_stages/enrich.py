@@ -80,10 +80,12 @@ def texton_of(part: int, table: Arrays) -> Texton:
     values, weights, spacing = table["appearance"].astype(float), table["domain"].astype(float), float(table["spacing"])
     return Texton(
         part=part,
-        template=make_template(values, weights, spacing * factor, float(table["spread"]), table["mean_blur"]),
+        template=make_template(
+            values, weights, spacing * factor, float(table["spread"]), table["mean_blur"], table["ridge"]
+        ),
         gauge=Gauge(
-            table["gram"], table["trend"], int(table["order"]), float(table["inflation"]), float(table["scale_variance"]),
-            table["gauge_cov"],
+            table["gram"], table["trend"], int(table["order"]), float(table["relief"]), float(table["inflation"]),
+            float(table["scale_variance"]), table["gauge_cov"],
         ),
         factor=factor,
         noise=float(table["noise"]),

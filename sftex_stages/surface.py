@@ -109,6 +109,8 @@ class Instances:
 def collect(frontal: list[Arrays], min_inlier: float, found: Arrays | None = None) -> Arrays:
     """Members of all usable textons and what the search `found` of them, one row each; `texton` is the part's number.
 
+    `searched` says which were found by search.
+
     Raises
     ------
     StageError
@@ -125,8 +127,10 @@ def collect(frontal: list[Arrays], min_inlier: float, found: Arrays | None = Non
         )
     rows = {name: np.concatenate([np.asarray(f[name]) for _, f in parts]) for name in names}
     rows["texton"] = np.concatenate([np.full(len(f["xy"]), k, np.int32) for k, f in parts])
+    detected = len(rows["xy"])
     if found is not None:
         rows = {name: np.concatenate([array, found[name]]) for name, array in rows.items()}
+    rows["searched"] = np.arange(len(rows["xy"])) >= detected
     good = int((rows["inlier"] > min_inlier).sum())
     if good < 3:
         raise StageError(
@@ -451,7 +455,9 @@ def outputs(
     off = np.linalg.norm(normal - tensors.normals(g), axis=1)  # in radians, but for a third order
     state = posterior_states(instances, g, spread)
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
-    maps = support.dense(field, solution.a, mask.shape, instances.xy[seen], spacing, errors)
+    # what a search finds fills holes; how far a measurement speaks is told by those that were there before
+    reach = support.reach(instances.xy[seen & ~table["searched"]], spacing)
+    maps = support.dense(field, solution.a, mask.shape, instances.xy[seen], spacing, errors, reach)
     piece = support.pieces(support.close_holes(maps["supported"] & mask, maps["closable"] & mask), spacing**2)
     valid = piece > 0
     nan = np.float32(np.nan)
@@ -535,4 +541,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=7, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=8, params=Params, run=run, inputs=("image", "frontal", "enrich"))

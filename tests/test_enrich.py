@@ -136,5 +136,6 @@ def test_the_surface_takes_what_was_found(parts, found):
     alone = surface.collect(parts, 0.8)
     n = len(alone["xy"])
     assert n == sum(len(part["xy"]) for part in parts) and len(rows["xy"]) == n + len(found["xy"])
-    for name in alone:
+    assert not alone["searched"].any() and rows["searched"].tolist() == [False] * n + [True] * len(found["xy"])
+    for name in set(alone) - {"searched"}:
         assert np.array_equal(rows[name], np.concatenate([alone[name], found[name]])), name

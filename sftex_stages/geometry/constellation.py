@@ -265,14 +265,18 @@ def _few(found: Candidates, others: Array, radius: Array, crowd: int) -> Ints:
 
 def first_of_each(xy: Array, transform: Array, close: float, free: Bools) -> Ints:
     """Rows, of those that are `free` (n,), that lie farther than `close` from every one before, in its frontal frame."""
-    free, inverse = free.copy(), np.linalg.inv(transform)
+    if len(xy) == 0:
+        return np.zeros(0, np.int64)
+    free, inverse, tree = free.copy(), np.linalg.inv(transform), cKDTree(xy)
+    reach = close * np.linalg.norm(transform, 2, axis=(1, 2))
     kept = []
-    while free.any():
-        i = int(free.argmax())
+    for i in range(len(xy)):
+        if not free[i]:
+            continue
         kept.append(i)
-        off = (xy - xy[i]) @ inverse[i].T
-        free &= (off**2).sum(1) >= close**2
-        free[i] = False
+        near = np.array(tree.query_ball_point(xy[i], reach[i]))
+        off = (xy[near] - xy[i]) @ inverse[i].T
+        free[near[(off**2).sum(1) < close**2]] = False
     return np.array(kept, np.int64)
 
 

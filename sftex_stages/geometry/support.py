@@ -58,12 +58,14 @@ def dense(
     xy: Float,
     spacing: float,
     errors: confidence.Errors,
+    reach: float,
 ) -> dict[str, NDArray]:
     """Maps of an image of `shape` (H, W): `height` px, `normals` (H, W, 3), `sigma` degrees, `supported`, and `closable`: where
     support all around would do.
 
-    `xy` (N, 2) are the measurements believed, `errors` what is known of the surface's errors. Height and gradient
-    are exact at every pixel; what varies slowly (variance, support) is evaluated on a coarse raster and interpolated.
+    `xy` (N, 2) are the measurements believed, which speak for the surface up to `reach` px along it, `errors` what is known
+    of the surface's errors. Height and gradient are exact at every pixel; what varies slowly (variance, support) is
+    evaluated on a coarse raster and interpolated.
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
     g = np.stack([spline.evaluate(f.grid, a, columns, rows, *d) for d in ((1, 0), (0, 1))], -1)
@@ -80,7 +82,7 @@ def dense(
     height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(f.grid, xy)
     seen = np.concatenate((xy, (stencil * a[index]).sum(1, keepdims=True)), 1)
-    far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach(xy, spacing)
+    far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach
     far /= np.where(surrounded(xy, points).reshape(far.shape), 1.0, BEYOND)
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {
