@@ -35,7 +35,7 @@ class Params(StageParams):
     max_growth: float = Field(2.2, ge=1, le=5, description="the domain may grow to this multiple of the first radius")
     iterations: int = Field(20, ge=5, le=100, description="EM iterations")
     affine_iterations: int = Field(6, ge=1, le=50, description="of which with free affine frames")
-    subset: int = Field(200, ge=3, description="instances that found the texton; the others are registered to it")
+    subset: int = Field(100, ge=3, description="copies that a texton is estimated from; the others are registered to it")
     adopt: float = Field(
         0.95, ge=0, le=1, description="other points are tried whose descriptor is as near as this share of the own"
     )
@@ -102,11 +102,13 @@ def empty(reason: str) -> Arrays:
         "prior": np.array(np.nan),
         "spread": np.array(np.nan),
         "mean_blur": np.zeros(3),
+        "ridge": np.zeros(8),
         "gram": np.eye(2),
         "trend": np.zeros(5),
         "order": np.array(0, np.int32),
         "inflation": np.array(np.nan),
         "scale_variance": np.array(np.nan),
+        "relief": np.array(0.0),
         "gauge_cov": np.zeros((8, 8)),
     } | no_rows()
 
@@ -155,7 +157,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     where0 = (2 * xy0 - extent) / extent.max()
 
     rng = np.random.default_rng(0)
-    few = np.sort(rng.permutation(len(members))[: params.subset])
+    few = np.sort(rng.permutation(len(members))[: 2 * params.subset])  # not all of them will show to be copies
     settings = Settings(
         half=half,
         half_limit=round(half * params.max_growth),
@@ -166,6 +168,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
         agreement=params.agreement,
         spread=(params.blur * factor) ** 2 + sampling_spread(factor),
         fit_spread=params.fit_blur,
+        most=params.subset,
     )
     texton = estimate_texton(image, xy[few], frames[few], where0[few], settings)
     if texton is None:

@@ -33,6 +33,7 @@ class Element(NamedTuple):
     domain: Float
     spacing: float
     blur: float
+    ridge: Float | None = None  # of what varies from copy to copy (`registration.py`)
 
 
 class Seen(NamedTuple):
@@ -135,7 +136,7 @@ def register_held(
             old[better] = now[better]
         if np.abs(step / solver.unit).max() < 1e-3:
             break
-    return registration.Registered(xy, frames, got.gain, got.slope, got.residual)
+    return registration.Registered(xy, frames, got.gain, got.variation, got.residual)
 
 
 def posterior(template: registration.Template, residual: Float, inlier: Float) -> Float:
@@ -169,7 +170,9 @@ def look_again(
     mean_blur = np.average(registration.blur(transform), axis=0, weights=inlier)
     values = element.appearance.astype(float)
     spread = point_spread(element.blur, factor)
-    template = registration.make_template(values, element.domain.astype(float), element.spacing * factor, spread, mean_blur)
+    template = registration.make_template(
+        values, element.domain.astype(float), element.spacing * factor, spread, mean_blur, element.ridge
+    )
     centre = texton.information_centre(template)
     at = (xy + 0.5) * factor - 0.5 - transform @ centre
     free = registration.register(image, template, at[good], transform[good], steps=4)

@@ -46,6 +46,7 @@ class Settings(NamedTuple):
     agreement: float  # share of the unrelated variance below which a pixel belongs to the element
     spread: float  # variance of the image's point spread, px², before looking
     fit_spread: bool
+    most: int = 100  # instances that are carried on once they show to be copies
 
 
 class Estimate(NamedTuple):
@@ -209,7 +210,9 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         xy, frames = compose_step(xy, frames, step)
         if iteration == settings.affine_iterations:
             # what is no view of this element by now is left to the last registration
-            keep = inlier > 1e-3
+            keep, copies = np.flatnonzero(inlier > 1e-3), np.flatnonzero(inlier > 0.5)
+            if len(copies) > settings.most:
+                keep = copies[np.linspace(0, len(copies) - 1, settings.most).astype(int)]
             founders = founders[keep]
             xy, frames, inlier, gain = xy[keep], frames[keep], inlier[keep], gain[keep]
             residual, step, variation = residual[keep], step[keep], variation[keep]

@@ -373,6 +373,17 @@ def test_texton_from_detector_frames_finds_normals_and_outliers(rng):
     assert [h[0] for h in texton.history] == [1, 5, 10, 20]
 
 
+def test_a_texton_is_carried_on_by_the_most_copies_that_are_asked_for(rng):
+    image, xy, t, _ = sheet(rng)
+    turn = np.linalg.svd(t)
+    start = 1.4 * (turn[0] @ turn[2])
+    texton = estimate_texton(image, xy, start, np.zeros((len(xy), 2)), SETTINGS._replace(most=20))
+    assert texton is not None
+    assert len(np.unique(texton.founders)) == len(texton.founders) == len(texton.xy) == len(texton.inlier) == 20
+    assert np.linalg.norm(texton.xy - xy[texton.founders], axis=1).max() < 4
+    assert all(len(a) == 20 for state in texton.history for a in state[1:])
+
+
 def test_no_texton_where_no_three_patches_are_alike(rng):
     image = rng.uniform(0, 1, (200, 200, 3)).astype(np.float32)
     xy = rng.uniform(20, 180, (12, 2))
