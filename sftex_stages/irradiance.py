@@ -80,8 +80,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     piece = np.asarray(surface["piece"])
     light = surface["instance/irradiance"].astype(float)
     texton = np.asarray(surface["instance/texton"])
-    outside = surface["instance/state"][:, 2].astype(float)
-    used = (surface["instance/inlier"] > params.min_inlier) & (light > 0) & np.isfinite(light) & (outside < 0.99)
+    used = (surface["instance/inlier"] > params.min_inlier) & (light > 0) & np.isfinite(light)
     if used.sum() < 3:
         raise StageError(
             f"only {int(used.sum())} instances are believed to show the surface; at least 3 are needed for an irradiance map. "
@@ -90,7 +89,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     present, index = np.unique(texton[used], return_inverse=True)
     xy = surface["instance/xy"][used].astype(float)
     sigma = np.hypot(surface["instance/irradiance_sigma"][used].astype(float), params.noise_floor)
-    trust = np.maximum(1 - outside[used], 0.01)
+    trust = 1 - surface["instance/state"][used, 2].astype(float)
     every = Instances(xy, np.log(light[used]), sigma, index, trust, _label_at(piece, xy))
     result = _fit(every, params)
     every = every.on_one_scale(result.offset)

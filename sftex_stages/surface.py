@@ -243,7 +243,9 @@ def look_again(
     rows = {name: value.copy() for name, value in rows.items()}
     for k in np.unique(rows["texton"]):
         part = inputs["frontal"][k]
-        element = direct.Element(part["appearance"], part["domain"], float(part["spacing"]), float(part["blur"]))
+        element = direct.Element(
+            part["appearance"], part["domain"], float(part["spacing"]), float(part["blur"]), part["ridge"]
+        )
         level = direct.level_of(element.spacing)
         if level not in levels:
             levels[level] = direct.at_level(rgb, level)
@@ -454,6 +456,8 @@ def outputs(
     normal = resolve(instances, g)
     off = np.linalg.norm(normal - tensors.normals(g), axis=1)  # in radians, but for a third order
     state = posterior_states(instances, g, spread)
+    heard = found.noise[instances.texton] <= calibration.DISAGREES
+    inlier = table["inlier"] * (1 - state[:, 2]) * heard
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
     # what a search finds fills holes; how far a measurement speaks is told by those that were there before
     reach = support.reach(instances.xy[seen & ~table["searched"]], spacing)
@@ -473,7 +477,7 @@ def outputs(
         "instance/transform": table["transform"].astype(np.float32),
         "instance/normal": camera.turn(instances.xy, normal).astype(np.float32),
         "instance/normal_sigma": np.degrees(np.hypot(sigma, off)).astype(np.float32),
-        "instance/inlier": table["inlier"].astype(np.float32),
+        "instance/inlier": inlier.astype(np.float32),
         "instance/irradiance": table["irradiance"].astype(np.float32),
         "instance/irradiance_rgb": table["irradiance_rgb"].astype(np.float32),
         "instance/irradiance_sigma": table["irradiance_sigma"].astype(np.float32),

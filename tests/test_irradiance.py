@@ -68,7 +68,7 @@ def test_noise_is_smoothed_and_outliers_of_either_kind_ignored():
     surface, _ = surface_of(noise=0.02, seed=1)
     surface["instance/irradiance"][::20] *= 3
     surface["instance/irradiance"][5::40] = 0  # no positive estimate: left out
-    surface["instance/state"][::20] = [0, 0, 1]
+    surface["instance/inlier"][::20] = 0
     out = run(surface)
     assert np.median(log_error(out)) < 0.01
 

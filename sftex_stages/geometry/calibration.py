@@ -21,7 +21,7 @@ FREEDOM = 3.0
 # What all textons have wrong together: so many standard errors of the mean shear, were the shears independent.
 COMMON = 1.5
 OWN_SAY = 0.25
-DISAGREES = 25.0  # noise factor from which a texton is said to disagree: errors of five times what it states
+DISAGREES = 9.0  # noise factor from which a texton is said to disagree: errors of three times what it states
 MEMBERS = 4.0  # instances' worth of prior that a texton's noise is as stated
 
 

@@ -95,7 +95,7 @@ def _contents(arrays: Mapping[str, Any], meta: Mapping[str, Any], scratch: Path)
     seen = np.isfinite(bare).all(axis=2)
     yield "albedo.png", _png(np.dstack([shown, np.where(seen, 255, 0).astype(np.uint8)]))
     yield "instances.png", _png(pictures.instances(photo, surface))
-    yield "textons.png", _png(pictures.textons(frontal, counts))
+    yield "textons.png", _png(pictures.textons(archive.judged(frontal, surface), counts))
     yield "height.exr", exports.exr(height, ("Z",), f"height, px toward the camera; {about}", scratch)
     yield "normals.exr", exports.exr(normals, ("N.X", "N.Y", "N.Z"), f"unit normals; {about}", scratch)
     channels = {"Y": light["map"], "sigma": light["sigma"]}

@@ -58,7 +58,7 @@ SCHEMA = {
     "instances/xy": Entry("f4", "N 2", "px", "centre in the image"),
     "instances/transform": Entry("f4", "N 2 2", "1", "maps frontal px to image px"),
     "instances/normal": Entry("f4", "N 3", "1", "unit normal with its sign resolved"),
-    "instances/inlier": Entry("f4", "N", "1", "posterior of being a view of its texton"),
+    "instances/inlier": Entry("f4", "N", "1", "posterior of being a view of its texton, and on the surface"),
     "instances/state": Entry("f4", "N 3", "1", "posteriors of: sign +, sign -, not from the surface"),
     "instances/irradiance": Entry("f4", "N", "relative", "irradiance, on one scale for all textons"),
     "instances/irradiance_sigma": Entry("f4", "N", "1", "standard deviation of its logarithm"),
@@ -163,7 +163,7 @@ def _collect(arrays: Mapping[str, Any]) -> Arrays:
         if group == "instances":
             data[name] = surface[f"instance/{short}"]
     data["instances/irradiance"] = irradiance["instance/irradiance"]
-    data |= {f"textons/{n}": a for n, a in _stack(frontal).items()}
+    data |= {f"textons/{n}": a for n, a in _stack(judged(frontal, surface)).items()}
     data["textons/instances"] = np.bincount(surface["instance/texton"], minlength=len(frontal))
     # The irradiance stage sees the textons that entered the surface alone; those after the last of them are missing.
     scale = irradiance["class_scale"]
@@ -203,6 +203,15 @@ def _stack(frontal: list[Arrays]) -> Arrays:
         "usable": np.array([t["usable"] for t in frontal], bool),
         "reason": np.array([str(t["reason"]) for t in frontal], np.str_),
     }
+
+
+def judged(frontal: list[Arrays], surface: Arrays) -> list[Arrays]:
+    """The textons' tables with the surface's verdict on those that the frontal stage let pass: `usable`, `reason`."""
+    out = list(frontal)
+    for part, words in zip(surface["texton/part"], surface["texton/reason"], strict=True):
+        if str(words):
+            out[part] = out[part] | {"usable": np.array(False), "reason": words}
+    return out
 
 
 def _create(file: h5py.File, name: str, array: np.ndarray, dtype: str) -> h5py.Dataset:

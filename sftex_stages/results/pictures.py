@@ -33,7 +33,7 @@ def instances(photo: np.ndarray, surface: Arrays, size: int = 1600) -> np.ndarra
     radius = _radius(surface["instance/xy"], (h, w))
     some = _apart(surface["instance/xy"], 2 * radius)
     xy, transform, normal = (surface[f"instance/{name}"][some] for name in ("xy", "transform", "normal"))
-    trust = (surface["instance/inlier"] * (1 - surface["instance/state"][:, 2]))[some]
+    trust = surface["instance/inlier"][some]
     sizes = np.linalg.svd(transform, compute_uv=False)[:, :1, None]
     typical = np.median(sizes) if len(sizes) else 1.0  # the unit disc's own size means nothing to a reader
     transform = transform / np.clip(sizes, typical / 2, typical * 2) * np.clip(sizes / typical, 0.5, 2)

@@ -62,7 +62,8 @@ def stage_arrays() -> dict[str, Any]:
         "surface": surface
         | {"normal_sigma": np.full((H, W), 3, "f4"), "energy": np.array(1.0), "camera": np.array("orthographic")}
         | {"focal_px": np.array(np.inf), "principal_point": np.array([64.5, 44.5]), "piece": piece}
-        | {f"instance/{k}": v for k, v in instance.items()},
+        | {f"instance/{k}": v for k, v in instance.items()}
+        | {"texton/part": np.array([0], np.int32), "texton/reason": np.array([""])},
         "irradiance": {
             "map": light.astype("f4"),
             "sigma": np.where(valid, 0.02, np.nan).astype("f4"),
