@@ -16,22 +16,21 @@ def render(surface, camera, kind="dots", light="constant", seed=0, size=(150, 12
 @pytest.mark.parametrize("camera", ["orthographic", "strong"])
 @pytest.mark.parametrize("surface", scenes.SURFACES)
 def test_normals_are_those_of_the_height(surface, camera):
-    s = render(surface, camera)
-    focal, centre = s.camera
-    y, x = np.indices(s.valid.shape, dtype=float)
-    shrink = 1 - s.height / focal
-    points = np.stack([(x - centre[0]) * shrink, (y - centre[1]) * shrink, s.height], -1)
+    view = scenes.look(Recipe(surface, "dots", "constant", camera, (150, 120), False), np.random.default_rng(0))
+    points, normals, valid = view.points, view.normals, view.valid
+    shrink = 1 - points[..., 2] / view.focal
+    np.testing.assert_allclose(points[..., 0], view.x * shrink, atol=1e-9)
     across = np.cross(points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1])
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    inner = s.valid[1:-1, 1:-1] & s.valid[1:-1, 2:] & s.valid[1:-1, :-2] & s.valid[2:, 1:-1] & s.valid[:-2, 1:-1]
-    inner &= s.normals[1:-1, 1:-1, 2] > 0.4
-    error = np.degrees(np.linalg.norm(across - s.normals[1:-1, 1:-1], axis=-1))[inner]
+    inner = valid[1:-1, 1:-1] & valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    inner &= normals[1:-1, 1:-1, 2] > 0.4
+    error = np.degrees(np.linalg.norm(across - normals[1:-1, 1:-1], axis=-1))[inner]
     assert len(error) > 1000 and np.quantile(error, 0.9) < 1.0
 
 
 @pytest.mark.parametrize("camera", ["orthographic", "weak", "strong"])
 def test_transforms_are_imaging_transforms_of_the_normals(camera):
-    s = render("bumps", camera, "small", size=(300, 260))
+    s = render("bumps", camera, "small", size=(150, 120))
     focal, centre = s.camera
     tensor, normal = s.transform @ np.swapaxes(s.transform, 1, 2), s.normal
     if np.isfinite(focal):  # seen along its own ray an element is what Lemma 1 says
@@ -45,11 +44,11 @@ def test_transforms_are_imaging_transforms_of_the_normals(camera):
 
 
 def test_a_dot_has_the_moments_of_its_transform():
-    s = render("plane", "strong", "dots", size=(400, 300))
+    s = render("plane", "weak", "dots", size=(240, 180))
     focal, _ = s.camera
     assert np.isfinite(focal)
     ground = np.abs(s.rgb - np.median(s.rgb, (0, 1))).sum(-1)
-    big = np.flatnonzero((s.texton == 0) & (np.abs(s.xy - [200, 150]).max(1) < 80))
+    big = np.flatnonzero((s.texton == 0) & (np.abs(s.xy - [120, 90]).max(1) < 60))
     for i in big:
         x0, y0 = np.rint(s.xy[i]).astype(int) - 16
         y, x = np.mgrid[y0 : y0 + 33, x0 : x0 + 33]
@@ -63,7 +62,7 @@ def test_a_dot_has_the_moments_of_its_transform():
         expected = s.transform[i] @ s.transform[i].T * (0.85 * s.radius[i]) ** 2 / 4
         # pixels and the point spread add 1/12 + 0.16 each way
         np.testing.assert_allclose(moments - 0.25 * np.eye(2), expected, rtol=0.06, atol=0.4)
-        np.testing.assert_allclose(mean, 0, atol=0.35)
+        np.testing.assert_allclose(mean, 0, atol=0.4)
 
 
 def test_a_scene_is_drawn_by_its_seed_and_written_as_the_benchmark_reads_it(tmp_path):

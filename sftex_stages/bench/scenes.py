@@ -238,7 +238,8 @@ def place(design: Print, points: Array, normals: Array, valid: Array, rng: np.ra
         least = 0.8 * design.pitch
     else:
         area = 1 / steep[allowed]
-        order = rng.choice(len(allowed), min(len(allowed), 40000), replace=False, p=area / area.sum())
+        enough = int(60 * area.sum() / design.pitch**2)
+        order = rng.choice(len(allowed), min(len(allowed), 40000, enough), replace=False, p=area / area.sum())
         which = rng.integers(len(design.motifs), size=len(allowed))
         least = design.pitch
     near = cKDTree(flat[allowed[order]]).query_ball_point(flat[allowed[order]], least)
@@ -292,18 +293,41 @@ def illuminate(name: str, points: Array, normals: Array, size: tuple[int, int], 
 # -------------------------------------------------------------------------------------------------------------- scene
 
 
-def render(recipe: Recipe, rng: np.random.Generator) -> Scene:
-    """The scene of a recipe."""
+class View(NamedTuple):
+    """A surface as the camera sees it."""
+
+    z: Height
+    focal: float  # px; inf: orthographic
+    x: Array  # (H, W) px from the centre
+    y: Array  # (H, W)
+    points: Array  # (H, W, 3)
+    normals: Array  # (H, W, 3)
+    valid: Array  # (H, W)
+
+
+def look(recipe: Recipe, rng: np.random.Generator) -> View:
+    """The surface of a recipe; the point on the axis is at the distance f."""
     w, h = recipe.size
-    centre = np.array([(w - 1) / 2, (h - 1) / 2])
     focal = {"weak": rng.uniform(2, 3), "strong": rng.uniform(1, 1.4)}.get(recipe.camera, np.inf) * w
-    z, there = surface(recipe.surface, recipe.size, rng)
-    y, x = np.mgrid[0:h, 0:w] - centre[::-1, None, None]
+    shape, there = surface(recipe.surface, recipe.size, rng)
+    level = shape(np.zeros(1), np.zeros(1))
+
+    def z(x: Array, y: Array) -> Array:
+        return shape(x, y) - level
+
+    y, x = np.mgrid[0:h, 0:w] - np.array([(h - 1) / 2, (w - 1) / 2])[:, None, None]
     points, valid = meet(z, focal, x, y)
     normals = _normals(z, points)
     to_camera = np.array([0, 0, 1.0]) if np.isinf(focal) else np.array([0, 0, focal]) - points
     facing = (normals * to_camera).sum(-1) / np.linalg.norm(to_camera, axis=-1)
-    valid &= (there(points[..., 0], points[..., 1]) > 0) & (facing > 0.05)
+    return View(z, focal, x, y, points, normals, valid & (there(points[..., 0], points[..., 1]) > 0) & (facing > 0.05))
+
+
+def render(recipe: Recipe, rng: np.random.Generator) -> Scene:
+    """The scene of a recipe."""
+    w, h = recipe.size
+    centre = np.array([(w - 1) / 2, (h - 1) / 2])
+    z, focal, x, y, points, normals, valid = look(recipe, rng)
     design = make_print(recipe.print, rng)
     at, which = place(design, points, normals, valid, rng)
     middle, normal = points.reshape(-1, 3)[at], normals.reshape(-1, 3)[at]
