@@ -22,6 +22,7 @@ TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
 OFF = (1.0, 0.2, 0.2)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
 SCREEN = 25.0  # nats by which sizes must follow the heights seen under orthography to be asked any further
+TEMPER = 8.0  # of what sizes say of the sign where they prove no perspective: orthographic scenes reach 20 nats by themselves
 FREEDOM = 4.0  # of the Student distribution of sizes in that
 GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
 
@@ -133,7 +134,8 @@ class Sizes:
 
 
     def follow(self, w: Float, h: Float) -> float:
-        """Nats by which log size goes linearly with heights `h` (M,) px, beyond its constant and what the slant explains.
+        """Nats by which log size goes linearly with heights `h` (M,) px, beyond its constant and what the slant explains;
+        negative if what stands out is small.
 
         Profile likelihoods of Student noise, one scale for all; `w` (M, 2) of the nodes.
         """
@@ -144,13 +146,14 @@ class Sizes:
             weight = np.ones(len(y))
             for _ in range(6):
                 half = np.sqrt(weight)[:, None]
-                r = y - x @ np.linalg.lstsq(x * half, y * half[:, 0])[0]
+                c = np.linalg.lstsq(x * half, y * half[:, 0])[0]
+                r = y - x @ c
                 scale = max(float(np.average(r**2, weights=weight)), 1e-12)
                 weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
             trials = scale * np.geomspace(0.05, 20, 40)
             student = 0.5 * (FREEDOM + 1) * np.log1p(r[:, None] ** 2 / trials / FREEDOM) + 0.5 * np.log(trials)
             cost.append(float(student.sum(0).min()))
-        return cost[0] - cost[1]
+        return float(np.sign(c[-1]) * (cost[0] - cost[1]))
 
 
 def summit(found: dict[float, float]) -> float:
@@ -168,7 +171,8 @@ def summit(found: dict[float, float]) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind)."""
+    """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind), a
+    `TEMPER`th of them under orthography."""
 
     camera: Camera
     gain: float
@@ -209,14 +213,16 @@ def choose(
         value = refine.refine(f, flat, spread, sizes.trust, sign * start, smooth, 3, height).evidence
         return value - (np.log(bend) * (sizes.trust > 0).sum() if sized else 0.0)  # density of sizes, not of heights
 
+    hint = 0.0
     if bend is None:
         rough = gaussian.make_field(grid, xy)
         firm = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
         factor = gaussian.posterior(rough, firm, gaussian.prior(rough, smooth))
         h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
         told = sizes.follow(w, h)
-        if told < SCREEN:
-            return Choice(Camera(centre, 0.0), told, 0.0)
+        hint = told / TEMPER
+        if abs(told) < SCREEN:
+            return Choice(Camera(centre, 0.0), abs(told), hint)
     flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w, np.zeros(len(w))) if bend is None else 0.0
     found: dict[float, float] = {}
     sign = 0.0
@@ -227,7 +233,7 @@ def choose(
             break
     else:
         best = max(found, key=lambda k: found[k])
-        return Choice(Camera(centre, 0.0), found[best] - flat, 0.0)
+        return Choice(Camera(centre, 0.0), found[best] - flat, hint)
     if bend is None:
         ratio = 1.6
         for _ in range(5):
@@ -241,5 +247,5 @@ def choose(
         bent, _, change = flatten_tensors(Camera(centre, bend), xy, w, covariance)
         own = max(found.values()) - evidence(bend, 1.0, False) - sizes.unrelated(xy, bent, change)
         if own < GAIN:
-            return Choice(Camera(centre, 0.0), own, 0.0)
+            return Choice(Camera(centre, 0.0), own, hint)
     return Choice(Camera(centre, bend), max(found.values()) - flat, sign)

@@ -113,15 +113,16 @@ def test_sizes_that_follow_the_slant_prove_no_perspective(view):
     grid, xy, w, covariance, sizes, slope = problem(view, 0.01, perspective.Camera(CENTRE, 0.0))
     smooth = gaussian.Smoothness(1.0, 40.0)
     choice = perspective.choose(grid, xy, w, covariance, sizes, slope, smooth, CENTRE, SIZE)
-    assert choice.camera.bend == 0 and choice.sign == 0 and choice.gain < perspective.GAIN
+    assert choice.camera.bend == 0 and choice.gain < perspective.GAIN
+    assert abs(choice.sign) < perspective.SCREEN / perspective.TEMPER
 
 
 def test_sizes_follow_depth_or_do_not(view):
     _, xy, w, _, sizes, _ = problem(view, 0.01, CAMERA)
     assert sizes.follow(w, h_of(xy)) > 10 * perspective.SCREEN
-    assert sizes.follow(w, -3 * h_of(xy)) == pytest.approx(sizes.follow(w, h_of(xy)), rel=1e-3)
+    assert sizes.follow(w, -3 * h_of(xy)) == pytest.approx(-sizes.follow(w, h_of(xy)), rel=1e-3)
     _, xy, w, _, sizes, _ = problem(view, 0.01, perspective.Camera(CENTRE, 0.0))
-    assert sizes.follow(w, h_of(xy)) < perspective.SCREEN
+    assert abs(sizes.follow(w, h_of(xy))) < perspective.SCREEN
 
 
 def test_heights_are_integrated_out_as_a_dense_gaussian():
@@ -155,3 +156,11 @@ def test_summit_of_samples_of_a_parabola_is_its_own():
     assert perspective.summit(values) == pytest.approx(top, rel=1e-9)
     rising = {k: k for k in (0.1, 0.2, 0.3)}
     assert perspective.summit(rising) == 0.3  # nothing beyond was looked at
+
+
+def test_sizes_that_prove_no_perspective_still_lean_to_a_sign(view):
+    rng = np.random.default_rng(0)
+    h, w = rng.normal(size=200), np.zeros((200, 2))
+    sizes = perspective.Sizes(0.03 * h + 0.1 * rng.normal(size=200), np.full(200, 0.01), np.ones(200))
+    told = sizes.follow(w, h)
+    assert 0 < told < perspective.SCREEN and sizes.follow(w, -h) == pytest.approx(-told)
