@@ -248,6 +248,15 @@ def solve_step(solver: Solver, left: Array, damping: Array, limit: float) -> Arr
     return step * np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None] * solver.unit
 
 
+def without_variation(template: Template, patches: Array, points: Array, gain: Array, variation: Array) -> Array:
+    """Patches (M, P, C), sampled at `points` (P, 2), of gain (M,), as they would be did nothing but the gain vary."""
+    light, tint = variation[:, :_POWERS].astype(np.float32), variation[:, _POWERS:]
+    even = patches - (template.level * gain[:, None] * tint).astype(np.float32)[:, None]
+    across = 1 + light @ light_powers(points, template.radius).astype(np.float32)
+    even /= np.clip(across, 0.25, 4, out=across)[..., None]
+    return even
+
+
 def channel_gains(template: Template, patches: Array, frames: Array, variation: Array) -> Array:
     """(M, C) gain of each channel of patches (M, P, C) sampled at the template's points through `frames` (M, 2, 2).
 

@@ -20,13 +20,13 @@ from .registration import (
     compose_step,
     estimate_spread,
     learn_variation,
-    light_powers,
     make_template,
     marginal_hessian,
     patch_grid,
     registration_step,
     sample,
     variation_ridge,
+    without_variation,
 )
 
 Array = NDArray[np.floating]
@@ -93,34 +93,14 @@ def seed_members(patches: Array, window: Array) -> Array:
     return np.where(near >= max(cut, 0.5), np.clip(near, 0.0, 1.0) ** 4, 0.0)
 
 
-def weighted_mean(
-    patches: Array,
-    gain: Array,
-    weights: Array,
-    light: Array | None = None,
-    powers: Array | None = None,
-    tint: Array | None = None,
-) -> tuple[Array, Array]:
-    """µ (P, C) of patches (M, P, C) = L_i (µ (1 + γ_i · b) + τ_i), and the variance (P,) of the residuals of d / L.
-
-    `gain` (M,) is L, `light` (M, 5) γ with `powers` (5, P) b, `tint` (M, C) τ; without them nothing but the gain varies. By
-    least squares, so that a sample counts by the square of its light; sums over instances are products, no patch is copied.
-    """
+def weighted_mean(patches: Array, gain: Array, weights: Array) -> tuple[Array, Array]:
+    """Mean and variance over instances of the patches (M, P, C) divided by their gain (M,): (P, C), (P,)."""
     share = weights / weights.sum()
-    d, shape = patches.reshape(len(patches), -1), patches.shape[1:]
-    lit, b = np.ones((len(share), 1)), np.ones((1, shape[0]))
-    if light is not None and powers is not None:
-        lit, b = np.concatenate([lit, light], 1), np.concatenate([b, powers])
-    seen = (((share / gain)[:, None] * lit).T.astype(np.float32) @ d).reshape(len(b), *shape)
-    square = ((share / gain**2).astype(np.float32) @ np.square(d)).reshape(shape)
-    if tint is not None:
-        seen = seen - ((share[:, None] * lit).T @ tint)[:, None]
-        for c in range(shape[1]):
-            square[:, c] += share @ tint[:, c] ** 2 - 2 * ((share / gain * tint[:, c]).astype(np.float32) @ patches[:, :, c])
-    light2 = (((share[:, None] * lit).T @ lit @ b) * b).sum(0)[:, None]  # Σ share (1 + γ · b)²
-    mean = (seen * b[..., None]).sum(0) / light2
+    flat = patches.reshape(len(patches), -1)
+    mean = ((share / gain).astype(np.float32) @ flat).reshape(patches.shape[1:])
+    square = ((share / gain**2).astype(np.float32) @ np.square(flat)).reshape(patches.shape[1:])
     effective = 1 / (share**2).sum()
-    var = np.maximum(square - light2 * mean**2, 0).mean(1) * effective / max(effective - 1, 0.5)
+    var = np.maximum(square - mean**2, 0).mean(1) * effective / max(effective - 1, 0.5)
     return mean.astype(np.float64), var.astype(np.float64)
 
 
@@ -247,9 +227,7 @@ def estimate_texton(image: Array, xy: Array, frames: Array, where: Array, settin
         sure = inlier > 0.5
         gain = gain / np.median(gain[sure]) if sure.any() else gain
         shares = inlier * _sharpness(frames)
-        light, tint = np.split(variation, [len(variation[0]) - values.shape[-1]], 1)
-        powers = light_powers(points, template.radius)
-        values, var = weighted_mean(patches, gain, shares, light, powers, template.level * tint)
+        values, var = weighted_mean(without_variation(template, patches, points, gain, variation), gain, shares)
         mean_blur = shares @ blur(frames) / shares.sum()
         weights = domain_weights(values, var, half, 0.1, settings.agreement)
         if (weights > 0).sum() < 9:

@@ -21,6 +21,7 @@ from sftex_stages.geometry.registration import (
     registration_step,
     sample,
     variation_ridge,
+    without_variation,
 )
 from sftex_stages.geometry.texton import centre_window
 
@@ -268,6 +269,8 @@ def test_light_and_tint_of_a_copy_do_not_move_it(rng):
     assert found.gain == pytest.approx(gain, rel=1e-3)
     assert found.variation == pytest.approx(np.concatenate([light, tint], 1), abs=2e-3)
     assert found.residual.max() < 1e-6
+    even = without_variation(template, patches, points, gain, found.variation)
+    assert even == pytest.approx(gain[:, None, None] * texture(points), rel=5e-3)
     coloured = gain[:, None] * np.array([1.2, 1.0, 0.7])
     patches = varied(points, np.ones(m), light, 0 * tint, template.level) * coloured[:, None]
     found = registration_step(loose(template), patches, still, damping=0.0)[1]

@@ -91,27 +91,6 @@ def test_weighted_mean_and_variance_over_instances(rng):
     assert mean == pytest.approx((2 * patches[0] + patches[1]) / 3)
 
 
-def test_mean_of_varied_copies_is_their_least_squares_element(rng):
-    """Against a regression of its own for every sample, and exact where the copies differ in nothing else."""
-    m, p, c = 9, 7, 3
-    values, powers = rng.uniform(0.5, 1, (p, c)), rng.uniform(-1, 1, (5, p))
-    gain, light, tint = rng.uniform(0.5, 2, m), rng.uniform(-0.2, 0.2, (m, 5)), rng.uniform(-0.1, 0.1, (m, c))
-    across = (1 + light @ powers)[..., None]
-    patches = gain[:, None, None] * (values * across + tint[:, None])
-    weights = rng.uniform(0.2, 1, m)
-    mean, var = weighted_mean(patches, gain, weights, light, powers, tint)
-    assert mean == pytest.approx(values, rel=1e-6) and var.max() < 1e-6
-    noisy = patches + 0.05 * rng.normal(size=patches.shape)
-    mean, var = weighted_mean(noisy, gain, weights, light, powers, tint)
-    share = weights[:, None, None] / weights.sum()
-    seen = noisy / gain[:, None, None] - tint[:, None]
-    best = (share * across * seen).sum(0) / (share * across**2).sum(0)
-    left = (share * (seen - best * across) ** 2).sum(0).mean(1)
-    effective = 1 / (share**2).sum()
-    assert mean == pytest.approx(best, rel=1e-5)
-    assert var == pytest.approx(left * effective / (effective - 1), rel=1e-3)
-
-
 def test_weighted_variance_is_unbiased(rng):
     weights = rng.uniform(0.1, 1, 8)
     found = [weighted_mean(rng.normal(size=(8, 500, 1)), np.ones(8), weights)[1].mean() for _ in range(20)]
