@@ -22,7 +22,7 @@ TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
 OFF = (1.0, 0.2, 0.2)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
 SCREEN = 25.0  # nats by which sizes must follow the heights seen under orthography to be asked any further
-TEMPER = 8.0  # of what sizes say of the sign where they prove no perspective: orthographic scenes reach 20 nats by themselves
+CHANCE = 20.0  # nats that orthographic scenes reach by themselves: what sizes say beyond them leans to a sign
 FREEDOM = 4.0  # of the Student distribution of sizes in that
 GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
 
@@ -171,8 +171,8 @@ def summit(found: dict[float, float]) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind), a
-    `TEMPER`th of them under orthography."""
+    """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind),
+    under orthography those beyond `CHANCE`."""
 
     camera: Camera
     gain: float
@@ -220,7 +220,7 @@ def choose(
         factor = gaussian.posterior(rough, firm, gaussian.prior(rough, smooth))
         h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
         told = sizes.follow(w, h)
-        hint = told / TEMPER
+        hint = float(np.sign(told)) * max(abs(told) - CHANCE, 0.0)
         if abs(told) < SCREEN:
             return Choice(Camera(centre, 0.0), abs(told), hint)
     flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w, np.zeros(len(w))) if bend is None else 0.0
