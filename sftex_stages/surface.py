@@ -195,7 +195,8 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     nodes = pool(instances, spacing, params)
     low, high = box[0] - 2 * spacing, box[1] + 2 * spacing
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
-    data = search_data(instances, nodes, spacing, params)
+    sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
+    data = search_data(instances, nodes, sizes, spacing, params)
     find = sign_search.search if params.method == "collapsed" else sign_search.by_em
     candidates = find(data, coarse, spacing, params.finalists, params.start)
     best = candidates[0]
@@ -203,7 +204,6 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     coupled = sign_search.own_coupling(data, coarse, best)
     regions, rise = sign_search.rivals(data, coupled, best.s)
     margin = np.append(sign_regions.margins(regions, rise, len(best.s)), np.nan)[nodes.member]
-    sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
     choice = choose_camera(nodes, coarse.grid, start, best.smooth, sizes, inputs["image"], params)
     found = verdict.decide(nodes, coarse, coupled, data, best, start, sizes, choice, hints, spacing)
     camera, before = choice.camera, nodes.xy
@@ -415,8 +415,10 @@ def on_one_scale(
     )
 
 
-def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, params: Params) -> sign_search.Data:
-    """What the sign search is given: gradients up to sign, and irradiance on one scale."""
+def search_data(
+    instances: Instances, nodes: pooling.Nodes, sizes: perspective.Sizes | None, spacing: float, params: Params
+) -> sign_search.Data:
+    """What the sign search is given: gradients up to sign, irradiance on one scale, and sizes."""
     d, covariance = tensors.gradient(nodes.w, nodes.covariance)
     log_outlier = -np.log(np.pi) + 0.5 * (np.linalg.slogdet(nodes.covariance)[1] - np.linalg.slogdet(covariance)[1])
     light = instances.table["irradiance"].astype(float)
@@ -428,7 +430,7 @@ def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, para
         e = np.exp(value)
         e, variance = e / e.mean(), variance * (e / e.mean()) ** 2
         cue = shading.make_shading(nodes.xy, e, variance, tensors.normals(d))
-    return sign_search.Data(nodes.xy, d, covariance, nodes.weight, log_outlier, cue)
+    return sign_search.Data(nodes.xy, d, covariance, nodes.weight, log_outlier, cue, sizes)
 
 
 def outputs(
@@ -493,13 +495,15 @@ def outputs(
 def record(candidates: list[sign_search.Candidate], mirror: bool) -> Arrays:
     """What was tried: evidences (C,) in nats of the candidate sign patterns, best first, and the light of the best one.
 
-    candidate/shape and candidate/shading add up to the evidence that ranks the tuned ones (candidate/tuned); candidate/origin
-    names the start. light (4,) = (a, b, c_x, c_y): irradiance a + b n_z + c·n_xy relative to its mean, NaN without shading.
+    candidate/shape, candidate/shading and candidate/sizes add up to the evidence that ranks the tuned ones (candidate/tuned);
+    candidate/origin names the start. light (4,) = (a, b, c_x, c_y): irradiance a + b n_z + c·n_xy relative to its mean, NaN
+    without shading.
     """
     light = np.full(4, np.nan) if candidates[0].light is None else candidates[0].light.direction
     return {
         "candidate/shape": np.array([c.shape for c in candidates]),
         "candidate/shading": np.array([c.shade for c in candidates]),
+        "candidate/sizes": np.array([c.size for c in candidates]),
         "candidate/origin": np.array([c.origin for c in candidates]),
         "candidate/tuned": np.array([c.tuned for c in candidates]),
         "light": light * np.array([1, 1, -1, -1]) if mirror else light,

@@ -57,7 +57,7 @@ def test_outputs_are_as_documented(found):
     normal = tensors.normals(np.stack((p, q), -1))[valid & np.isfinite(p) & np.isfinite(q)]
     stored = found["normals"][valid & np.isfinite(p) & np.isfinite(q)]
     assert (normal * stored).sum(-1).min() > 0.999
-    evidence = found["candidate/shape"] + found["candidate/shading"]
+    evidence = found["candidate/shape"] + found["candidate/shading"] + found["candidate/sizes"]
     assert evidence[0] == evidence[found["candidate/tuned"]].max()
 
 

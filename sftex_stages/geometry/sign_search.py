@@ -16,7 +16,17 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, roughness, shading, sign_regions, signs, surface_em
+from sftex_stages.geometry import (
+    blocks,
+    gaussian,
+    perspective,
+    roughness,
+    shading,
+    sign_regions,
+    signs,
+    surface_em,
+    tensors,
+)
 from sftex_stages.geometry.refine import climb
 
 Float = NDArray[np.floating]
@@ -29,12 +39,14 @@ OUTLIER = 0.05  # prior share of nodes that are not from the surface
 MOST_REGIONS = 400  # that patterns may differ in to be exchanged
 AFTERTHOUGHT, PASSES = 100.0, 2  # nats behind the best up to which a pattern is reconsidered, and how often
 SAY_OF_SHADING = 0.5  # of its log likelihood: what one light does not explain is correlated between neighbours
+SAY_OF_SIZES = 0.5  # of the nats beyond chance by which sizes follow heights, for the same reason
+SIZES_NEAR = 60  # nodes whose sizes tell how they change about a place
 
 
 @dataclass(frozen=True)
 class Data:
     """Nodes at `xy` (N, 2) px: gradient up to sign `d` (N, 2), its covariance (N, 2, 2), belief `trust` (N,) in 0…1, log
-    density (N,) an outlier would have there, and irradiance against normals (None: no such cue)."""
+    density (N,) an outlier would have there; irradiance against normals, and sizes of the elements (None: no such cue)."""
 
     xy: Float
     d: Float
@@ -42,15 +54,17 @@ class Data:
     trust: Float
     log_outlier: Float
     shading: shading.Shading | None
+    sizes: perspective.Sizes | None = None
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sign pattern `s` (N,): evidence of the shape and of the shading in nats, and the settings it was judged at."""
+    """A sign pattern `s` (N,): evidence of shape, shading and sizes in nats, and the settings it was judged at."""
 
     s: Float
     shape: float
     shade: float
+    size: float
     smooth: gaussian.Smoothness
     noise: float
     inside: Float  # (N,) posterior of being from the surface
@@ -62,7 +76,7 @@ class Candidate:
 
     @property
     def evidence(self) -> float:
-        return self.shape + self.shade
+        return self.shape + self.shade + self.size
 
 
 def starts(data: Data) -> tuple[Float, list[str]]:
@@ -74,6 +88,20 @@ def starts(data: Data) -> tuple[Float, list[str]]:
     columns = [-(centred @ axis) * lean, lean, -(centred * data.d).sum(1, keepdims=True)]
     names = [f"{kind} {45 * k}°" for kind in ("cylinder", "plane") for k in range(4)] + ["sphere"]
     return np.where(np.concatenate(columns, 1) < 0, -1.0, 1.0), names
+
+
+def size_starts(data: Data) -> tuple[Float, list[str]]:
+    """Signs (N, 1) of a surface that rises where elements become larger, as perspective has it: none without sizes."""
+    if data.sizes is None or len(data.d) < SIZES_NEAR:
+        return np.zeros((len(data.d), 0)), []
+    near = cKDTree(data.xy).query(data.xy, SIZES_NEAR)[1]
+    offset = data.xy[near] - data.xy[:, None]
+    basis = np.concatenate((np.ones_like(offset[..., :1]), offset), 2)
+    weight = (data.sizes.trust / data.sizes.variance)[near]
+    normal = np.einsum("nk,nki,nkj->nij", weight, basis, basis)
+    right = np.einsum("nk,nki,nk->ni", weight, basis, data.sizes.value[near])
+    rise = np.linalg.solve(normal + 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3), right[..., None])
+    return np.where((rise[:, 1:, 0] * data.d).sum(1) < 0, -1.0, 1.0)[:, None], ["sizes"]
 
 
 def lit_starts(data: Data) -> tuple[Float, list[str]]:
@@ -145,6 +173,14 @@ def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
     return SAY_OF_SHADING * max(light.log_likelihood - data.shading.null.log_likelihood - 2.0, 0.0), light
 
 
+def size_of(data: Data, h: Float) -> float:
+    """Nats that the elements' sizes give a surface of heights `h` (N,), or its mirror image: those beyond chance."""
+    if data.sizes is None:
+        return 0.0
+    told = abs(data.sizes.follow(tensors.predict(data.d)[0], h))
+    return SAY_OF_SIZES * max(told - perspective.CHANCE, 0.0)
+
+
 def judge(
     data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, noise: float, rounds: int, origin: str
 ) -> Candidate:
@@ -188,7 +224,8 @@ def judge(
             factor = float(np.exp(best[2]))
         inside = data.trust * _inside(data, y - mean, alone, factor)
     shade, light = shade_of(data, s)
-    return Candidate(s, score(best), shade, smooth, factor, inside, a, light, origin, rounds > 0)
+    size = size_of(data, gaussian.heights(f, a))
+    return Candidate(s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0)
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -229,17 +266,20 @@ def search(
         smooth = gaussian.Smoothness(strength, reach * spacing)
         c = signs.coupling(f, data.d, weight, smooth)
         spectral = signs.spectral_starts(c, 3) if k < 2 and start == "auto" else patterns[:, :0]
+        sized, labels_sized = size_starts(data) if start == "auto" else (patterns[:, :0], [])
         shaded, labels_lit = lit_starts(data) if start == "auto" else (patterns[:, :0], [])
-        patterns = np.concatenate((patterns, spectral, shaded), 1)
-        names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_lit
-        lit = np.concatenate((lit, np.zeros(spectral.shape[1], bool), np.ones(shaded.shape[1], bool)))
+        patterns = np.concatenate((patterns, spectral, sized, shaded), 1)
+        names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_sized + labels_lit
+        lit = np.concatenate((lit, np.zeros(spectral.shape[1] + sized.shape[1], bool), np.ones(shaded.shape[1], bool)))
         hot = min(5.0 / max(float(np.median(c.own[c.own > 0])), 1e-9), 1.0)
         patterns = rung(data, c, patterns, lit, labels, hot)
         if data.shading is not None:  # every pattern may go on with the shading, and without
             patterns, names = np.concatenate((patterns, patterns), 1), names + names
             lit = np.concatenate((lit, ~lit))
         shape = 0.5 * c.log_det - signs.energies(c, patterns, np.zeros_like(patterns))
-        value = np.array([shape[j] + shade_of(data, patterns[:, j])[0] for j in range(len(names))])
+        found = signs.surface_of(c, patterns)
+        told = [size_of(data, gaussian.heights(f, found[:, j])) for j in range(len(names))]
+        value = np.array([shape[j] + shade_of(data, patterns[:, j])[0] + told[j] for j in range(len(names))])
         order = np.argsort(-value, kind="stable")
         order = order[distinct(patterns[:, order], data.trust)][:survivors]
         patterns, names, lit = patterns[:, order], [names[j] for j in order], lit[order]

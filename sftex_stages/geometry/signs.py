@@ -117,12 +117,15 @@ def flip_regions(c: Coupling, s: Float, bias: Float, region: NDArray[np.integer]
     h = member.T @ bias
     own = np.diag(k)
     t = np.concatenate((np.ones((count, 1)), 1 - 2 * np.eye(count)), 1)
+    pull = k @ t
     for _ in range(20 * count):
-        gain = -t * (k @ t - own[:, None] * t + h[:, None])
+        gain = -t * (pull - own[:, None] * t + h[:, None])
         site = gain.argmax(0)
-        move = gain[site, np.arange(t.shape[1])] > 1e-9
-        if not move.any():
+        moved = np.flatnonzero(gain[site, np.arange(t.shape[1])] > 1e-9)
+        if len(moved) == 0:
             break
-        t[site[move], np.flatnonzero(move)] *= -1
+        site = site[moved]
+        t[site, moved] *= -1
+        pull[:, moved] += 2 * k[:, site] * t[site, moved]
     energy = -0.5 * (t * (k @ t)).sum(0) - h @ t
     return s * t[region, energy.argmin()]

@@ -1,9 +1,10 @@
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 
-from sftex_stages.geometry import gaussian, shading, sign_search, signs, spline, surface_em, tensors
+from sftex_stages.geometry import gaussian, perspective, shading, sign_search, signs, spline, surface_em, tensors
 
 
 def problem(n, seed, noise=0.05, extent=100.0, bend=60.0):
@@ -166,3 +167,22 @@ def test_roughness_of_its_own_is_in_a_candidates_coupling():
     c = sign_search.own_coupling(data, f, found)
     assert np.allclose(signs.surface_of(c, found.s), found.a, rtol=0.05, atol=0.05 * np.abs(found.a).max())
     assert not np.allclose(c.factor.band, sign_search.own_coupling(data, f, plain).factor.band)
+
+
+def test_sizes_start_the_search_on_the_signs_of_folds():
+    """Folds as perspective shows them: an element's log size is h / f, and rises the way the surface does."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(0, 400, (900, 2))
+    h = 15 * np.sin(xy[:, 0] / 25) + 10 * np.cos(xy[:, 1] / 40)
+    g = np.stack((15 / 25 * np.cos(xy[:, 0] / 25), -10 / 40 * np.sin(xy[:, 1] / 40)), 1)
+    truth = rng.choice([-1.0, 1.0], 900)
+    covariance = np.tile(1e-4 * np.eye(2), (900, 1, 1))
+    sizes = perspective.Sizes(h / 1500 + 1e-4 * rng.normal(size=900), np.full(900, 1e-8), np.ones(900))
+    data = sign_search.Data(xy, truth[:, None] * g, covariance, np.ones(900), np.full(900, -3.0), None, sizes)
+    pattern, names = sign_search.size_starts(data)
+    steep = np.linalg.norm(g, axis=1) > 0.2
+    assert names == ["sizes"] and (pattern[:, 0] == truth)[steep].mean() > 0.95
+    assert sign_search.size_of(data, h) == pytest.approx(sign_search.size_of(data, -h)) and sign_search.size_of(data, h) > 100
+    assert sign_search.size_of(data, 15 * rng.normal(size=900)) == 0  # what chance does, says nothing
+    blind = replace(data, sizes=None)
+    assert sign_search.size_starts(blind)[0].shape == (900, 0) and sign_search.size_of(blind, h) == 0
