@@ -74,4 +74,4 @@ def outlying(label: Array, distance: Array, size: Array, params: Params) -> Arra
     return out
 
 
-STAGE = Stage(name="cluster", version=1, params=Params, run=run, inputs=("detect",))
+STAGE = Stage(name="cluster", version=2, params=Params, run=run, inputs=("detect",))

@@ -145,4 +145,4 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     }
 
 
-STAGE = Stage(name="detect", version=1, params=Params, run=run, inputs=("image",))
+STAGE = Stage(name="detect", version=2, params=Params, run=run, inputs=("image",))

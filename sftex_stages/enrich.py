@@ -171,4 +171,4 @@ def look(rgb: Array, texton: Texton, at: Candidates, known: Array, max_sigma: fl
     return rows(Views._make(column[taken] for column in views), np.full(len(taken), -1), inlier[taken], factor)
 
 
-STAGE = Stage(name="enrich", version=1, params=Params, run=run, inputs=("image", "frontal"))
+STAGE = Stage(name="enrich", version=2, params=Params, run=run, inputs=("image", "frontal"))

@@ -331,4 +331,4 @@ def progress(image: Array, texton: Estimate) -> Array:
     return np.stack(pictures).astype(np.float32)
 
 
-STAGE = Stage(name="frontal", version=4, params=Params, run=run, inputs=("image", "detect", "cluster"), fan_out="cluster")
+STAGE = Stage(name="frontal", version=5, params=Params, run=run, inputs=("image", "detect", "cluster"), fan_out="cluster")

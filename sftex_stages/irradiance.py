@@ -230,4 +230,4 @@ def _maps(found: field.Irradiance, box: tuple[slice, slice]) -> tuple[Float, Flo
     return value, cv2.remap(coarse.astype(np.float32), *np.meshgrid(*at), cv2.INTER_LINEAR)
 
 
-STAGE = Stage(name="irradiance", version=4, params=Params, run=run, inputs=("image", "surface"))
+STAGE = Stage(name="irradiance", version=5, params=Params, run=run, inputs=("image", "surface"))
