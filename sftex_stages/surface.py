@@ -224,7 +224,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     for _ in range(params.direct):
         rows = look_again(inputs, rows, fine.grid, solution.a, camera, params)
         instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, pace, params)
-    results = outputs(mask, instances, nodes, solution, fine, spacing, camera)
+    results = outputs(mask, instances, nodes, solution, fine, spacing, camera, (spacing / pace) ** 1.5)
     results["instance/sign_margin"] = margin.astype(np.float32)
     results |= verdict.by_piece(results["piece"], before, found, regions, rise)
     return results | record(candidates, found.mirrored)
@@ -441,15 +441,21 @@ def outputs(
     field: gaussian.Field,
     spacing: float,
     camera: perspective.Camera,
+    crowded: float,
 ) -> Arrays:
-    """Dense maps and instances."""
+    """Dense maps and instances.
+
+    The posterior's covariance is multiplied by `crowded`: nodes in cells under `spacing` px share the errors of a motif, and
+    are not as many witnesses as they are.
+    """
     table = instances.table
     index, stencil = camera.stencil(field.grid, instances.xy)
     g = np.einsum("npk,nk->np", stencil, solution.a[index])
     k, found = instances.trust > 0, instances.calibration
     residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
     moved = confidence.influence(field, solution, nodes, residual, instances.texton)
-    inverse = blocks.selected_inverse(solution.factor)
+    diagonal, below = blocks.selected_inverse(solution.factor)
+    inverse = crowded * diagonal, crowded * below
     errors = confidence.Errors(
         instances.xy[k], residual[k], chi2[k], found.common, moved, field.grid, inverse, camera
     )
