@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from .engine.stage import Arrays, Stage, StageParams
-from .frontal import level_image, no_rows, rows
+from .frontal import no_rows, rows, template_of
 from .geometry import constellation
 from .geometry.constellation import SAME, Candidates, Known
-from .geometry.registration import Template, make_template, register
+from .geometry.pyramid import level_image
+from .geometry.registration import Template, register
 from .geometry.texton import independent_samples, information_centre, posterior, weighted_contrast
 from .geometry.views import Gauge, Views, measure
 
@@ -77,12 +78,10 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
 def texton_of(part: int, table: Arrays) -> Texton:
     """Texton number `part` from what `frontal` delivers of it."""
     factor = 2.0 ** -int(table["level"])
-    values, weights, spacing = table["appearance"].astype(float), table["domain"].astype(float), float(table["spacing"])
+    weights = table["domain"]
     return Texton(
         part=part,
-        template=make_template(
-            values, weights, spacing * factor, float(table["spread"]), table["mean_blur"], table["ridge"]
-        ),
+        template=template_of(table),
         gauge=Gauge(
             table["gram"], table["trend"], int(table["order"]), float(table["relief"]), float(table["inflation"]),
             float(table["scale_variance"]), table["gauge_cov"],
@@ -90,7 +89,7 @@ def texton_of(part: int, table: Arrays) -> Texton:
         factor=factor,
         noise=float(table["noise"]),
         prior=float(table["prior"]),
-        radius=float(np.sqrt((weights > 0.3 * weights.max()).sum() / np.pi)) * spacing,
+        radius=float(np.sqrt((weights > 0.3 * weights.max()).sum() / np.pi)) * float(table["spacing"]),
         circular=bool(table["circular"]),
     )  # fmt: skip
 

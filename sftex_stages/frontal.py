@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from .engine.stage import Arrays, Stage, StageParams
-from .geometry.registration import patch_grid, register, sample
+from .geometry.pyramid import level_image, sampling_spread
+from .geometry.registration import Template, make_template, patch_grid, register, sample
 from .geometry.texton import (
     Estimate,
     Settings,
@@ -53,33 +53,8 @@ class Params(StageParams):
 
 _ENOUGH = 20  # instances that chance does not bring together, however large their cluster
 _CIRCLE_SLACK = 4.0  # one size is all that a circle's upgrade fits, so that scattered sizes say less against it
-_MEMO: dict[Any, Any] = {}  # the pyramid of the image in hand, shared by the jobs that one worker runs
-_SIZES: dict[str, Any] = {}  # the same of the descriptors: squared lengths, and log sizes of their frames
-
-
-def sampling_spread(factor: float) -> float:
-    """Variance of the point spread that a pyramid level and its sampling add, in px² of the level; `factor` its scale.
-
-    Halving averages over boxes as wide as the new pixels; bilinear sampling, on average over subpixel positions, adds 1/6.
-    """
-    return max(1 - factor**2, 0) / 12 + 1 / 6
-
-
-def level_image(rgb: Array, level: int) -> Array:
-    """`rgb` at pyramid level: −1 doubled, 0 as it is, 1 halved, … (x_level = (x + ½) 2^−level − ½)."""
-    if _MEMO.get("rgb") is not rgb:
-        _MEMO.clear()
-        _MEMO["rgb"] = rgb
-    if level not in _MEMO:
-        if level == 0:
-            _MEMO[level] = np.ascontiguousarray(rgb, np.float32)
-        elif level < 0:
-            _MEMO[level] = cv2.resize(rgb, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        else:
-            above = level_image(rgb, level - 1)
-            size = (max(1, (above.shape[1] + 1) // 2), max(1, (above.shape[0] + 1) // 2))
-            _MEMO[level] = cv2.resize(above, size, interpolation=cv2.INTER_AREA)
-    return _MEMO[level]
+# of the descriptors in hand, shared by the jobs that one worker runs: squared lengths, and log sizes of their frames
+_SIZES: dict[str, Any] = {}
 
 
 def empty(reason: str) -> Arrays:
@@ -290,6 +265,13 @@ def finish(
         "relief": np.array(gauge.relief),
         "gauge_cov": gauge.covariance,
     } | rows(views, members, inlier, factor)
+
+
+def template_of(table: Arrays) -> Template:
+    """The texton of a `table` that this stage delivered, ready to register to; lengths in px of its pyramid level."""
+    factor = 2.0 ** -int(table["level"])
+    values, weights, spacing = table["appearance"].astype(float), table["domain"].astype(float), float(table["spacing"])
+    return make_template(values, weights, spacing * factor, float(table["spread"]), table["mean_blur"], table["ridge"])
 
 
 def rows(views: Views, index: Indices, inlier: Array, factor: float) -> Arrays:

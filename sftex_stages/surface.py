@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from sftex_stages.engine.stage import Arrays, Stage, StageParams
 from sftex_stages.errors import StageError
+from sftex_stages.frontal import template_of
 from sftex_stages.geometry import (
     blocks,
     calibration,
@@ -21,6 +22,7 @@ from sftex_stages.geometry import (
     mirror,
     perspective,
     pooling,
+    pyramid,
     refine,
     shading,
     sign_regions,
@@ -239,19 +241,14 @@ def look_again(
     slope = refine.limit(np.einsum("npk,nk->np", stencil, a[index]), STEEP)
     p = direct.foreshortening(slope, camera, xy)
     rgb = inputs["image"]["rgb"]
-    levels: dict[int, Float] = {}
     rows = {name: value.copy() for name, value in rows.items()}
     for k in np.unique(rows["texton"]):
         part = inputs["frontal"][k]
-        element = direct.Element(
-            part["appearance"], part["domain"], float(part["spacing"]), float(part["blur"]), part["ridge"]
-        )
-        level = direct.level_of(element.spacing)
-        if level not in levels:
-            levels[level] = direct.at_level(rgb, level)
+        level = int(part["level"])
         at = np.flatnonzero(rows["texton"] == k)
         transform, inlier = rows["transform"][at].astype(float), rows["inlier"][at].astype(float)
-        seen = direct.look_again(levels[level], 2.0**-level, element, xy[at], transform, inlier, p[at], params.min_inlier)
+        image, template = pyramid.level_image(rgb, level), template_of(part)
+        seen = direct.look_again(image, 2.0**-level, template, xy[at], transform, inlier, p[at], params.min_inlier)
         if seen is None:
             continue
         rows["inlier"][at] = seen.inlier
@@ -555,4 +552,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=10, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=11, params=Params, run=run, inputs=("image", "frontal", "enrich"))

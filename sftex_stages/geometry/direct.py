@@ -11,7 +11,6 @@ One that the first registration had given up is measured again, freely, from whe
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,17 +24,6 @@ FIT_ROUNDS = 4  # of A and the similarities in turn
 NOISE_FLOOR = 0.01  # of the contrast
 
 
-class Element(NamedTuple):
-    """A texton as delivered: `appearance` (n, n, C), `domain` (n, n), `spacing` px of the image between their points, `blur` px
-    of the point spread (a standard deviation)."""
-
-    appearance: Float
-    domain: Float
-    spacing: float
-    blur: float
-    ridge: Float | None = None  # of what varies from copy to copy (`registration.py`)
-
-
 class Seen(NamedTuple):
     """M instances registered again: posterior `inlier` (M,); `moved` (M,), whether place and transform are new; `xy` (M, 2) px,
     `transform` (M, 2, 2)."""
@@ -44,28 +32,6 @@ class Seen(NamedTuple):
     moved: NDArray[np.bool_]
     xy: Float
     transform: Float
-
-
-def level_of(spacing: float) -> int:
-    """Pyramid level on which points `spacing` px apart lie one to two px apart; −1 is the image doubled."""
-    return max(int(np.floor(np.log2(spacing) + 1e-3)), -1)
-
-
-def at_level(rgb: Float, level: int) -> Float:
-    """The image (H, W, C) at a pyramid level: x_level = (x + ½) 2^−level − ½."""
-    out = np.ascontiguousarray(rgb, np.float32)
-    if level < 0:
-        return np.asarray(cv2.resize(out, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
-    for _ in range(level):
-        size = max(1, (out.shape[1] + 1) // 2), max(1, (out.shape[0] + 1) // 2)
-        out = np.asarray(cv2.resize(out, size, interpolation=cv2.INTER_AREA))
-    return out
-
-
-def point_spread(blur: float, factor: float) -> float:
-    """Variance, px² of a pyramid level of scale `factor`, of a point spread of `blur` px, of the averaging over the level's
-    pixels, and of bilinear sampling."""
-    return (blur * factor) ** 2 + max(1 - factor**2, 0) / 12 + 1 / 6
 
 
 def foreshortening(g: Float, camera: perspective.Camera, xy: Float) -> Float:
@@ -151,7 +117,14 @@ def posterior(template: registration.Template, residual: Float, inlier: Float) -
 
 
 def look_again(
-    image: Float, factor: float, element: Element, xy: Float, transform: Float, inlier: Float, p: Float, least: float
+    image: Float,
+    factor: float,
+    template: registration.Template,
+    xy: Float,
+    transform: Float,
+    inlier: Float,
+    p: Float,
+    least: float,
 ) -> Seen | None:
     """All instances of one texton as a surface of foreshortenings `p` (M, 2, 2) shows them.
 
@@ -159,6 +132,8 @@ def look_again(
     ----------
     image, factor
         the pyramid level (h, w, C) that the element is sampled from, and its px per px of the image.
+    template
+        the texton, in px of that level.
     xy, transform, inlier : (M, 2), (M, 2, 2), (M,)
         as delivered, px of the image. Those of posterior 0 are left as they are: they lie on others.
     least
@@ -167,12 +142,6 @@ def look_again(
     good = inlier > least
     if good.sum() < 4:
         return None
-    mean_blur = np.average(registration.blur(transform), axis=0, weights=inlier)
-    values = element.appearance.astype(float)
-    spread = point_spread(element.blur, factor)
-    template = registration.make_template(
-        values, element.domain.astype(float), element.spacing * factor, spread, mean_blur, element.ridge
-    )
     centre = texton.information_centre(template)
     at = (xy + 0.5) * factor - 0.5 - transform @ centre
     free = registration.register(image, template, at[good], transform[good], steps=4)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import glyph, render
 
-from sftex_stages.geometry import direct, imaging, perspective, registration
+from sftex_stages.geometry import direct, imaging, perspective, pyramid, registration
 
 HALF, RADIUS = 14, 17.0
 SKEW = np.array([[1.04, 0.03], [0.0, 0.95]])  # of the frame that the appearance is drawn in
@@ -21,7 +21,7 @@ def element():
     spacing = 1.1 * RADIUS / HALF
     points = registration.patch_grid(HALF, spacing).reshape(2 * HALF + 1, -1, 2) @ SKEW.T / RADIUS
     domain = np.where(np.linalg.norm(points, axis=-1) < 1.05, 1.0, 0.0)
-    return direct.Element(glyph(points), domain, spacing, 0.4)
+    return glyph(points), domain, spacing
 
 
 def slopes(scene):
@@ -62,19 +62,9 @@ def test_frame_that_the_appearance_is_drawn_in_is_found(scene, mirrored):
     assert np.sign(np.linalg.det(found)) == mirrored
 
 
-def test_levels_sample_an_element_at_one_to_two_px():
-    assert [direct.level_of(s) for s in (0.4, 0.5, 0.99, 1.0, 1.9, 2.0, 5.0)] == [-1, -1, -1, 0, 0, 1, 2]
-    ramp = np.tile(np.arange(64.0)[:, None, None], (1, 48, 3))
-    for level in (-1, 0, 1, 2):
-        image = direct.at_level(ramp, level)
-        row = len(image) // 2
-        assert image[row, 3, 0] == pytest.approx((row + 0.5) * 2.0**level - 0.5, abs=0.06)  # as good as bicubic is
-
-
 def test_registration_with_foreshortening_held_finds_scale_turn_and_place(scene, element):
     rng = np.random.default_rng(2)
-    values, domain = element.appearance, element.domain
-    template = registration.make_template(values, domain, element.spacing)
+    template = registration.make_template(*element)
     p, n = foreshortening(scene), len(scene.xy)
     true = scene.transform / RADIUS
     off = np.exp(0.06 * rng.normal(size=n))[:, None, None] * imaging.rotation(0.1 * rng.normal(size=n))
@@ -91,7 +81,7 @@ def test_registration_with_foreshortening_held_finds_scale_turn_and_place(scene,
 
 def delivered(scene, element, skew):
     """Transforms as a frontal stage gives them, without the frame's own `skew`, and places of the detail's centre."""
-    template = registration.make_template(element.appearance, element.domain, element.spacing)
+    template = registration.make_template(*element)
     centre = direct.texton.information_centre(template)
     transform = scene.transform / RADIUS
     return scene.xy + transform @ (skew @ centre), transform
@@ -108,8 +98,9 @@ def test_what_the_surface_does_not_show_is_no_instance(scene, element):
     start[astray] = start[astray] @ np.array([[1.15, 0.12], [0.0, 0.9]])
     inlier = np.where(np.isin(np.arange(len(xy)), astray), 0.4, 0.95)
     inlier[20] = 0.0  # lies on another one
-    plain = element._replace(blur=0.0)
-    seen = direct.look_again(image, 1.0, plain, xy, start @ SKEW, inlier, p, 0.8)
+    mean_blur = registration.blur(transform @ SKEW).mean(0)
+    template = registration.make_template(*element, pyramid.sampling_spread(1.0), mean_blur)
+    seen = direct.look_again(image, 1.0, template, xy, start @ SKEW, inlier, p, 0.8)
     assert (seen.inlier[gone] < 0.2).all() and seen.inlier[20] == 0
     rest = np.setdiff1d(np.arange(len(xy)), [*gone, 20])
     assert (seen.inlier[rest] > 0.8).mean() > 0.95
@@ -128,4 +119,4 @@ def test_too_few_instances_fix_no_frame(scene, element):
     xy, transform = delivered(scene, element, SKEW)
     inlier = np.where(np.arange(len(xy)) < 3, 0.9, 0.2)
     p = foreshortening(scene)
-    assert direct.look_again(scene.rgb, 1.0, element, xy, transform, inlier, p, 0.8) is None
+    assert direct.look_again(scene.rgb, 1.0, registration.make_template(*element), xy, transform, inlier, p, 0.8) is None
