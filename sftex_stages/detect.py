@@ -45,10 +45,11 @@ def encode(rgb: Array, mask: Array) -> Array:
     white = max(float(np.percentile(luminance, 99.5)), 1e-9)
     if white <= 1.0 and luminance.max() <= 1.0:
         white = 1.0 if white > 0.25 else white
-    mixture = most_contrast(display(rgb / max(white, float(np.percentile(rgb, 99.5)))), mask)
+    coded = display(rgb / max(white, float(np.percentile(rgb, 99.5))))
+    mixture = most_contrast(coded, mask)
     if mixture is None:
         return np.round(255 * display(luminance / white)).astype(np.uint8)
-    grey = display(rgb / max(white, float(np.percentile(rgb, 99.5)))) @ mixture
+    grey = coded @ mixture
     low, high = np.percentile(grey[mask], (0.5, 99.5))
     return np.round(255 * np.clip(0.5 + (grey - (low + high) / 2) / max(high - low, 1), 0, 1)).astype(np.uint8)
 

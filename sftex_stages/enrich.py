@@ -18,7 +18,7 @@ from .geometry import constellation
 from .geometry.constellation import SAME, Candidates, Known
 from .geometry.pyramid import level_image
 from .geometry.registration import Template, register
-from .geometry.texton import independent_samples, information_centre, posterior, weighted_contrast
+from .geometry.texton import element_radius, independent_samples, information_centre, posterior, weighted_contrast
 from .geometry.views import Gauge, Views, measure
 
 Array = NDArray[np.floating]
@@ -78,7 +78,6 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
 def texton_of(part: int, table: Arrays) -> Texton:
     """Texton number `part` from what `frontal` delivers of it."""
     factor = 2.0 ** -int(table["level"])
-    weights = table["domain"]
     return Texton(
         part=part,
         template=template_of(table),
@@ -89,7 +88,7 @@ def texton_of(part: int, table: Arrays) -> Texton:
         factor=factor,
         noise=float(table["noise"]),
         prior=float(table["prior"]),
-        radius=float(np.sqrt((weights > 0.3 * weights.max()).sum() / np.pi)) * float(table["spacing"]),
+        radius=element_radius(table["domain"]) * float(table["spacing"]),
         circular=bool(table["circular"]),
     )  # fmt: skip
 

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
+from ..detect import display
+
 Array = NDArray[Any]
 Height = Callable[[Array, Array], Array]
 
@@ -399,9 +401,7 @@ def write(scene: Scene, path: Path, about: str, noise: bool, rng: np.random.Gene
     rgb = scene.rgb
     if noise:
         rgb = rgb + 0.01 * rng.normal(size=rgb.shape) * np.sqrt(0.2 + np.maximum(rgb, 0))
-    rgb = np.clip(rgb, 0, 1)
-    coded = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 1e-9) ** (1 / 2.4) - 0.055)
-    eight = np.round(255 * coded).astype(np.uint8)[..., ::-1]
+    eight = np.round(255 * display(rgb)).astype(np.uint8)[..., ::-1]
     suffix = ".jpg" if noise else ".png"
     cv2.imwrite(str(path.with_name(path.name + suffix)), eight, [cv2.IMWRITE_JPEG_QUALITY, 85] if noise else [])
     focal, centre = scene.camera

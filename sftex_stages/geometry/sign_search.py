@@ -1,11 +1,11 @@
 """Many starts, several smoothnesses, every cue, one measure: the search for the sign pattern of greatest evidence.
 
 Every smoothness of a ladder, smooth to rough, anneals all starts (leading eigenvectors, the paper's cylinder in four
-directions, leaning planes, a bowl, lights from six azimuths), with and without shading, moves whole regions, and hands its
-patterns on as starts of the next. The best distinct patterns then flip regions of every size (`sign_regions.py`) and are
-judged by their evidence, each with its own best smoothness and noise and with outliers let go, so that patterns found
-with different settings compare. Those that come near the best are reconsidered under a prior that is rough where their surface
-is (`roughness.py`): one smoothness for all prefers patterns that iron folds out.
+directions, leaning planes, a bowl, the elements' sizes, lights from six azimuths), with and without shading, moves whole
+regions, and hands its patterns on as starts of the next. The best distinct patterns then flip regions of every size
+(`sign_regions.py`) and are judged by their evidence, each with its own best smoothness and noise and with outliers let go,
+so that patterns found with different settings compare. Those that come near the best are reconsidered under a prior that is
+rough where their surface is (`roughness.py`): one smoothness for all prefers patterns that iron folds out.
 """
 
 from dataclasses import dataclass, replace
@@ -261,13 +261,13 @@ def search(
     pairs = neighbours(data.xy)
     labels = [patches(data, pairs, level) for level in (0.15, 0.3)]
     lit = np.zeros(len(names), bool)
+    none: tuple[Float, list[str]] = patterns[:, :0], []
+    (sized, labels_sized), (shaded, labels_lit) = (size_starts(data), lit_starts(data)) if start == "auto" else (none, none)
     pool: list[tuple[float, Float, gaussian.Smoothness, str]] = []
     for k, (strength, reach) in enumerate(LADDER):
         smooth = gaussian.Smoothness(strength, reach * spacing)
         c = signs.coupling(f, data.d, weight, smooth)
         spectral = signs.spectral_starts(c, 3) if k < 2 and start == "auto" else patterns[:, :0]
-        sized, labels_sized = size_starts(data) if start == "auto" else (patterns[:, :0], [])
-        shaded, labels_lit = lit_starts(data) if start == "auto" else (patterns[:, :0], [])
         patterns = np.concatenate((patterns, spectral, sized, shaded), 1)
         names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_sized + labels_lit
         lit = np.concatenate((lit, np.zeros(spectral.shape[1] + sized.shape[1], bool), np.ones(shaded.shape[1], bool)))

@@ -290,6 +290,11 @@ def information_centre(template: Template) -> Array:
     return power @ template.points / max(power.sum(), 1e-30)
 
 
+def element_radius(weights: Array) -> float:
+    """Radius, in grid points, of a disc as large as the part of a domain of `weights` that counts."""
+    return float(np.sqrt((weights > 0.3 * weights.max()).sum() / np.pi))
+
+
 def independent_samples(template: Template) -> float:
     """Number of independent residuals that a patch is judged by: neighbouring grid points share the image's blur."""
     return float(np.clip((template.weights > 0.02 * template.weights.max()).sum() / 8, 6, 40))

@@ -22,6 +22,7 @@ from .metric import (
 )
 from .registration import Registered, Template, channel_gains, sample
 from .texton import (
+    element_radius,
     independent_samples,
     information_centre,
     strain_covariance,
@@ -139,9 +140,7 @@ def unique(xy: Array, residual: Array, transform: Array, template: Template) -> 
     """1 for instances to keep, 0 for those that have slid onto a better registered one (M,)."""
     order = np.argsort(residual)
     keep = np.zeros(len(xy))
-    used = template.weights > 0.3 * template.weights.max()
-    radius = np.sqrt(used.sum() / np.pi)
-    size = np.sqrt(np.abs(np.linalg.det(transform))) * radius
+    size = np.sqrt(np.abs(np.linalg.det(transform))) * element_radius(template.weights)
     taken, count = np.empty_like(xy), 0
     for i in order:
         apart2 = ((taken[:count] - xy[i]) ** 2).sum(1)
