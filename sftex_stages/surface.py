@@ -206,7 +206,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     coupled = sign_search.own_coupling(data, coarse, best)
     regions, rise = sign_search.rivals(data, coupled, best.s)
     margin = np.append(sign_regions.margins(regions, rise, len(best.s)), np.nan)[nodes.member]
-    choice = choose_camera(nodes, coarse.grid, start, best.smooth, sizes, inputs["image"], params)
+    choice = choose_camera(nodes, coarse.grid, start, best, sizes, inputs["image"], params)
     found = verdict.decide(nodes, coarse, coupled, data, best, start, sizes, choice, hints, spacing)
     camera, before = choice.camera, nodes.xy
     start = found.sign[found.piece, None] * start
@@ -344,7 +344,7 @@ def choose_camera(
     nodes: pooling.Nodes,
     grid: spline.Grid,
     start: Float,
-    smooth: gaussian.Smoothness,
+    best: sign_search.Candidate,
     sizes: perspective.Sizes | None,
     image: Arrays,
     params: Params,
@@ -359,7 +359,8 @@ def choose_camera(
     if params.camera == "orthographic" or sizes is None:
         return perspective.Choice(perspective.Camera(centre, bend or 0.0), 0.0, 0.0)
     size = float(max(shape))
-    return perspective.choose(grid, nodes.xy, nodes.w, nodes.covariance, sizes, start, smooth, centre, size, bend)
+    w, covariance = nodes.w, nodes.covariance
+    return perspective.choose(grid, nodes.xy, w, covariance, sizes, start, best.smooth, best.noise, centre, size, bend)
 
 
 def read_hints(params: HintParams, shape: tuple[int, int]) -> mirror.Hints:

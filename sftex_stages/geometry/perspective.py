@@ -20,10 +20,12 @@ Float = NDArray[np.floating]
 
 TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
-OFF = (1.0, 0.2, 0.2)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
+OFF = (1.0, 0.01, 0.01)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
 SCREEN = 25.0  # nats by which sizes must follow the heights seen under orthography to be asked any further
 CHANCE = 20.0  # nats that orthographic scenes reach by themselves: what sizes say beyond them leans to a sign
 FREEDOM = 4.0  # of the Student distribution of sizes in that
+ROUNDS = 4  # of refinement for each camera tried
+DOUBT, MOST_DOUBT = 2.0, 0.5  # times what the curvature of that says of log 1/f, for the same reason; and the most of it
 GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
 
 
@@ -127,11 +129,10 @@ class Sizes:
         columns = np.stack((np.ones_like(steep), steep, steep**2), 1)
         return gaussian.Heights(value, precision, columns, np.array(OFF) / bend)
 
-    def unrelated(self, xy: Float, w: Float, change: Float) -> float:
-        """Log likelihood in nats of one size for all elements, at the best noise factor."""
+    def unrelated(self, xy: Float, w: Float, change: Float) -> tuple[float, float]:
+        """Log likelihood in nats of one size for all elements, at the best noise factor, and that factor."""
         height = self.heights(ORTHOGRAPHIC, xy, w, change)
-        return max(height.over(float(k)).unrelated() for k in np.geomspace(*refine.HEIGHT_FACTORS, 30))
-
+        return max((height.over(k).unrelated(), k) for k in np.geomspace(*refine.HEIGHT_FACTORS, 30).tolist())
 
     def follow(self, w: Float, h: Float) -> float:
         """Nats by which log size goes linearly with heights `h` (M,) px, beyond its constant and what the slant explains;
@@ -143,10 +144,12 @@ class Sizes:
         columns = np.stack((np.ones_like(h), steep, steep**2, h - h.mean()), 1) * root[:, None]
         y, cost = self.value * root, []
         for x in (columns[:, :3], columns):
-            weight = np.ones(len(y))
+            weight, scale = np.ones(len(y)), 1.0
+            ridge = np.full(x.shape[1], 1e-12 * float((x**2).sum()))
+            ridge[1:3] += 1 / np.square(OFF[1:])
             for _ in range(6):
-                half = np.sqrt(weight)[:, None]
-                c = np.linalg.lstsq(x * half, y * half[:, 0])[0]
+                heavy = x * weight[:, None]
+                c = np.linalg.solve(heavy.T @ x + np.diag(scale * ridge), heavy.T @ y)
                 r = y - x @ c
                 scale = max(float(np.average(r**2, weights=weight)), 1e-12)
                 weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
@@ -156,27 +159,31 @@ class Sizes:
         return float(np.sign(c[-1]) * (cost[0] - cost[1]))
 
 
-def summit(found: dict[float, float]) -> float:
-    """Where the parabola, over log x, through the greatest of values {x: value} and its neighbours has its top."""
+def summit(found: dict[float, float]) -> tuple[float, float]:
+    """Where the parabola, over log x, through the greatest of values {x: value} and its neighbours has its top, and the
+    standard deviation of log x if the values are log likelihoods: infinite where the greatest has no neighbour on a side."""
     x = np.log(sorted(found))
     y = np.array([found[k] for k in sorted(found)])
     k = int(y.argmax())
     if not 0 < k < len(x) - 1:
-        return float(np.exp(x[k]))
+        return float(np.exp(x[k])), np.inf
     left, right = x[k] - x[k - 1], x[k + 1] - x[k]
     before, after = (y[k] - y[k - 1]) / left, (y[k] - y[k + 1]) / right
-    move = (before * right - after * left) / (2 * (before + after)) if before + after > 0 else 0.0
-    return float(np.exp(x[k] + move))
+    if before + after <= 0:
+        return float(np.exp(x[k])), np.inf
+    move = (before * right - after * left) / (2 * (before + after))
+    return float(np.exp(x[k] + move)), float(np.sqrt((left + right) / (2 * (before + after))))
 
 
 @dataclass(frozen=True)
 class Choice:
     """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind),
-    under orthography those beyond `CHANCE`."""
+    under orthography those beyond `CHANCE`; standard deviation of log 1/f, 0 if it is known."""
 
     camera: Camera
     gain: float
     sign: float
+    doubt: float = 0.0
 
 
 def choose(
@@ -187,6 +194,7 @@ def choose(
     sizes: Sizes,
     start: Float,
     smooth: gaussian.Smoothness,
+    noise: float,
     centre: tuple[float, float],
     size: float,
     bend: float | None = None,
@@ -197,21 +205,31 @@ def choose(
     ----------
     grid, xy, w, covariance
         the field's grid; nodes (M, 2) with w (M, 2) of the image and its covariance (M, 2, 2).
-    start, smooth
-        gradients (M, 2) with signs relative to one another, and a smoothness to start from.
+    start, smooth, noise
+        gradients (M, 2) with signs relative to one another, and a smoothness and a noise factor to start from.
     centre, size
         principal point (x, y) and longer side of the image, px.
     bend
         1/f if it is known: only the sign is asked for then.
     """
 
-    def evidence(bend: float, sign: float, sized: bool = True) -> float:
+    def told(bend: float, signs: tuple[float, ...]) -> list[float]:
+        """Log likelihood of the sizes under 1/f for signs of the surface, given what the tensors say there.
+
+        Tensors alone like some bends better than others, as the prior has it: that is not theirs to say.
+        """
         camera = Camera(centre, bend)
         flat, spread, change = flatten_tensors(camera, xy, w, covariance)
         f = gaussian.make_field(grid, xy, camera.stretch(xy))
-        height = sizes.heights(camera, xy, flat, change) if sized else None
-        value = refine.refine(f, flat, spread, sizes.trust, sign * start, smooth, 3, height).evidence
-        return value - (np.log(bend) * (sizes.trust > 0).sum() if sized else 0.0)  # density of sizes, not of heights
+        height = sizes.heights(camera, xy, flat, change)
+
+        def evidence(sign: float, height: gaussian.Heights | None) -> float:
+            smooth, noise = tuned.smooth, tuned.noise
+            start = sign * tuned.gradient
+            return refine.refine(f, flat, spread, sizes.trust, start, smooth, ROUNDS, height, noise, scatter).evidence
+
+        alone = evidence(1.0, None) + np.log(bend) * (sizes.trust > 0).sum()  # density of sizes, not of heights
+        return [evidence(sign, height) - alone for sign in signs]
 
     hint = 0.0
     if bend is None:
@@ -219,15 +237,19 @@ def choose(
         firm = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
         factor = gaussian.posterior(rough, firm, gaussian.prior(rough, smooth))
         h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
-        told = sizes.follow(w, h)
-        hint = float(np.sign(told)) * max(abs(told) - CHANCE, 0.0)
-        if abs(told) < SCREEN:
-            return Choice(Camera(centre, 0.0), abs(told), hint)
-    flat = evidence(0.0, 1.0, False) + sizes.unrelated(xy, w, np.zeros(len(w))) if bend is None else 0.0
+        follow = sizes.follow(w, h)
+        hint = float(np.sign(follow)) * max(abs(follow) - CHANCE, 0.0)
+        if abs(follow) < SCREEN:
+            return Choice(Camera(centre, 0.0), abs(follow), hint)
+    flat, scatter = sizes.unrelated(xy, w, np.zeros(len(w)))
+    # All are judged from settings that suit the flat one: rounds enough to leave them, not to find them from afar.
+    tuned = refine.refine(
+        gaussian.make_field(grid, xy), w, covariance, sizes.trust, start, smooth, 2 * ROUNDS, noise=noise
+    )
     found: dict[float, float] = {}
-    sign = 0.0
+    sign, doubt = 0.0, 0.0
     for trial in TRIALS if bend is None else (bend * size,):
-        up, down = (evidence(trial / size, s) for s in (1.0, -1.0))
+        up, down = told(trial / size, (1.0, -1.0))
         found[trial], sign = max(up, down), up - down
         if found[trial] > flat + GAIN or bend is not None:
             break
@@ -240,12 +262,8 @@ def choose(
             best = max(found, key=lambda k: found[k])
             for k in (best * ratio, best / ratio):
                 if BENDS[0] <= k <= BENDS[1] and not any(abs(np.log(k / j)) < 0.01 for j in found):
-                    found[k] = evidence(k / size, np.sign(sign))
+                    found[k] = told(k / size, (float(np.sign(sign)),))[0]
             ratio = ratio if max(found, key=lambda k: found[k]) != best else ratio**0.5
-        bend = summit(found) / size
-        # Tensors alone may like any bend, toward rims above all: the sizes must say by themselves that they follow depth.
-        bent, _, change = flatten_tensors(Camera(centre, bend), xy, w, covariance)
-        own = max(found.values()) - evidence(bend, 1.0, False) - sizes.unrelated(xy, bent, change)
-        if own < GAIN:
-            return Choice(Camera(centre, 0.0), own, hint)
-    return Choice(Camera(centre, bend), max(found.values()) - flat, sign)
+        top, doubt = summit(found)
+        bend = top / size
+    return Choice(Camera(centre, bend), max(found.values()) - flat, sign, min(DOUBT * doubt, MOST_DOUBT))

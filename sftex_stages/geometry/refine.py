@@ -16,8 +16,8 @@ from sftex_stages.geometry import blocks, gaussian, roughness, tensors
 Float = NDArray[np.floating]
 
 FREEDOM = 4.0  # of the Student distribution; two dimensions
-NOISE_FACTORS = (0.05, 50.0)
-HEIGHT_FACTORS = (0.1, 100.0)
+NOISE_FACTORS = (0.2, 50.0)
+HEIGHT_FACTORS = (0.02, 100.0)
 LOCAL_ROUNDS = (1, 1, 2)  # of each pass that learns where the surface is rough; only those beyond the first weigh by residuals
 
 
@@ -98,6 +98,7 @@ def refine(
     """
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
+    noise = float(np.clip(noise, *NOISE_FACTORS))
     x, pace = np.log([smooth.strength, smooth.reach, noise]), np.array([0.7, 0.7, 0.7])
     if height is not None:
         x, pace = np.append(x, np.log(height_noise)), np.append(pace, 0.7)
@@ -107,7 +108,7 @@ def refine(
 
     def score(x: Float) -> float:
         strength, reach, noise = map(float, np.exp(x[:3]))
-        if not gaussian.reasonable(f, strength, reach) or not NOISE_FACTORS[0] <= noise <= NOISE_FACTORS[1]:
+        if not gaussian.reasonable(f, strength, reach) or not NOISE_FACTORS[0] * (1-1e-9) <= noise <= NOISE_FACTORS[1]:
             return -np.inf
         if height is not None and not HEIGHT_FACTORS[0] <= np.exp(x[3]) <= HEIGHT_FACTORS[1]:
             return -np.inf
