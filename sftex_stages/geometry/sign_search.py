@@ -38,8 +38,7 @@ ANNEAL_STEPS, LIGHT_EVERY = 24, 6
 OUTLIER = 0.05  # prior share of nodes that are not from the surface
 MOST_REGIONS = 400  # that patterns may differ in to be exchanged
 AFTERTHOUGHT, PASSES = 100.0, 2  # nats behind the best up to which a pattern is reconsidered, and how often
-SAY_OF_SHADING = 0.5  # of its log likelihood: what one light does not explain is correlated between neighbours
-SAY_OF_SIZES = 0.5  # of the nats beyond chance by which sizes follow heights, for the same reason
+SAY_OF_SIZES = 0.5  # of the nats beyond chance by which sizes follow heights: neighbours share errors of their size
 SIZES_NEAR = 60  # nodes whose sizes tell how they change about a place
 
 
@@ -72,7 +71,7 @@ class Candidate:
     light: shading.Light | None
     origin: str
     tuned: bool  # whether smoothness and noise were searched for it, or are those it was found at
-    rough: Float | None = None  # factors of the blocks of the prior (`roughness.py`)
+    rough: Float | None = None  # factors of the prior's cells (`roughness.py`)
 
     @property
     def evidence(self) -> float:
@@ -143,7 +142,7 @@ def bias_of(data: Data, m: Float, lit: NDArray[np.bool_], lights: list[shading.L
     if data.shading is not None:
         for k in np.flatnonzero(lit):
             lights[k] = light = shading.fit(data.shading, m[:, k], lights[k], 1 if lights[k] else 4)
-            bias[:, k] = SAY_OF_SHADING * data.trust * shading.pull(data.shading, light)
+            bias[:, k] = data.trust * shading.pull(data.shading, light)
     return bias
 
 
@@ -170,7 +169,7 @@ def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
     if data.shading is None:
         return 0.0, None
     light = shading.fit(data.shading, s, rounds=4)
-    return SAY_OF_SHADING * max(light.log_likelihood - data.shading.null.log_likelihood - 2.0, 0.0), light
+    return max(light.log_likelihood - data.shading.null.log_likelihood - 2.0, 0.0), light
 
 
 def size_of(data: Data, h: Float) -> float:
