@@ -83,7 +83,7 @@ class Params(StageParams):
     )
     model_error: float = Field(0.03, gt=0, le=0.5, description="Error of pooled tensors that no averaging removes")
     nodes: int = Field(1500, ge=50, le=20000, description="Most nodes that the sign search pools the instances in")
-    detail: float = Field(0.8, gt=0.2, le=4, description="Spacing of the surface's grid, in mean spacings of nodes")
+    detail: float = Field(0.56, gt=0.2, le=4, description="Spacing of the surface's grid, in mean spacings of nodes")
     shading: bool = Field(True, description="Use irradiance against normals as a cue for signs")
     direct: int = Field(
         0, ge=0, le=5, description="Rounds of the direct method: instances registered again as the surface shows them"
@@ -91,7 +91,8 @@ class Params(StageParams):
     finalists: int = Field(4, ge=1, le=50, description="Sign patterns that are compared by their full evidence")
 
 
-ROUGH, CLOSER = 1.5, 0.7  # a surface that varies within so many node spacings is looked at in cells of that share of them
+TURN = 0.5  # of what a node knows: a cell in which the surface turns by more is quartered
+ROUNDS = 3  # of the first refinement
 STEEP = 3.5  # slope (74 degrees) beyond which instances are not registered again any steeper: nothing is left of them
 
 
@@ -106,6 +107,7 @@ class Instances:
     calibration: calibration.Calibration
     covariance: Float  # of w, (N, 2, 2)
     log_scale: Float  # (N,) of the calibrated transforms, up to a constant a texton
+    cell: Float  # (N,) px of the cells that they are pooled in
 
 
 def collect(frontal: list[Arrays], min_inlier: float, found: Arrays | None = None) -> Arrays:
@@ -154,7 +156,14 @@ def prepare(rows: Arrays, params: Params, camera: perspective.Camera | None = No
     result = calibration.calibrate(xy, transform, covariance, texton, np.maximum(trust, 1e-6), params.model_error)
     spread = covariance * result.noise[texton][:, None, None] + (params.model_error**2 / 2) * np.eye(2)
     log_scale = np.log(calibration.scales(transform, result.e[texton]))
-    return Instances(rows, xy, trust, texton.astype(np.int64), result, spread, log_scale)
+    cell = np.full(len(xy), spacing_of(xy[trust > 0], params.nodes))
+    return Instances(rows, xy, trust, texton.astype(np.int64), result, spread, log_scale, cell)
+
+
+def spacing_of(xy: Float, most: int) -> float:
+    """Side in px of square cells, at most about `most` of them, that points `xy` (N, 2) are pooled in."""
+    area = float(np.prod(np.maximum(np.ptp(xy, axis=0), 1.0)))
+    return float(np.sqrt(area / min(len(xy), most)))
 
 
 def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
@@ -192,9 +201,8 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     instances = prepare(rows, params)
     used = instances.trust > 0
     box = instances.xy[used].min(0), instances.xy[used].max(0)
-    area = float(np.prod(np.maximum(box[1] - box[0], 1.0)))
-    spacing = float(np.sqrt(area / min(used.sum(), params.nodes)))
-    nodes = pool(instances, spacing, params)
+    spacing = spacing_of(instances.xy[used], params.nodes)
+    nodes = pool(instances, params)
     low, high = box[0] - 2 * spacing, box[1] + 2 * spacing
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
     sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
@@ -212,21 +220,19 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     start = found.sign[found.piece, None] * start
     if camera.bend:
         instances = prepare(rows, params, camera)
-        nodes = pool(instances, spacing, params)
+        nodes = pool(instances, params)
         start = start[cKDTree(before).query(nodes.xy)[1]]
     height = heights(instances, nodes, camera, spacing)
-    fine = gaussian.make_field(spline.cover(low, high, params.detail * spacing), nodes.xy, camera.stretch(nodes.xy))
-    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, 3, height=height)
-    pace = spacing
-    if solution.smooth.reach < ROUGH * spacing:
-        pace = CLOSER * spacing
-        grid = spline.cover(low, high, params.detail * pace)
-        nodes, fine, solution, height = refit(instances, grid, fine, solution, camera, pace, params)
-    instances, nodes, fine, solution = recalibrate(instances, nodes, fine, solution, camera, pace, params, height)
+    fine = gaussian.make_field(coarse.grid, nodes.xy, camera.stretch(nodes.xy))
+    solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, ROUNDS, height, best.noise)
+    grid = spline.cover(low, high, params.detail * spacing)
+    instances, nodes, fine, solution, height = refit(instances, grid, fine, solution, camera, spacing, params)
+    instances, nodes, fine, solution = recalibrate(instances, nodes, fine, solution, camera, spacing, params, height)
     for _ in range(params.direct):
         rows = look_again(inputs, rows, fine.grid, solution.a, camera, params)
-        instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, pace, params)
-    results = outputs(mask, instances, nodes, solution, fine, spacing, camera, (spacing / pace) ** 1.5)
+        instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, spacing, params)
+    other = doubted(rows, instances, fine, solution, choice, spacing, params) if choice.doubt else None
+    results = outputs(mask, instances, nodes, solution, fine, spacing, camera, other)
     results["instance/sign_margin"] = margin.astype(np.float32)
     results |= verdict.by_piece(results["piece"], before, found, regions, rise)
     return results | record(candidates, found.mirrored)
@@ -271,7 +277,7 @@ def refine_again(
 ) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
     """The surface refined from instances `rows` that were registered again."""
     instances = prepare(rows, params, camera)
-    nodes, field, solution, height = refit(instances, field.grid, field, solution, camera, spacing, params)
+    instances, nodes, field, solution, height = refit(instances, field.grid, field, solution, camera, spacing, params)
     return recalibrate(instances, nodes, field, solution, camera, spacing, params, height)
 
 
@@ -283,16 +289,39 @@ def refit(
     camera: perspective.Camera,
     spacing: float,
     params: Params,
-) -> tuple[pooling.Nodes, gaussian.Field, refine.Solution, gaussian.Heights | None]:
-    """The surface `solution` on `field` refined from `instances` pooled anew, in cells of `spacing` px, on `grid`."""
-    nodes = pool(instances, spacing, params)
+) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution, gaussian.Heights | None]:
+    """The surface `solution` on `field` refined on `grid` from `instances` pooled anew, more finely where it turns."""
+    nodes = pool(instances, params)
+    instances = quartered(instances, nodes, field.grid, solution.a, camera)
+    nodes = pool(instances, params)
     stretch = camera.stretch(nodes.xy)
     start = gaussian.gradients(gaussian.make_field(field.grid, nodes.xy, stretch), solution.a)
     height = heights(instances, nodes, camera, spacing)
     field = gaussian.make_field(grid, nodes.xy, stretch)
     w, covariance, weight = nodes.w, nodes.covariance, nodes.weight
     solution = refine.refine(field, w, covariance, weight, start, solution.smooth, 3, height, solution.noise)
-    return nodes, field, solution, height
+    return instances, nodes, field, solution, height
+
+
+def doubted(
+    rows: Arrays,
+    instances: Instances,
+    field: gaussian.Field,
+    solution: refine.Solution,
+    choice: perspective.Choice,
+    spacing: float,
+    params: Params,
+) -> confidence.Other:
+    """The same surface as a camera shows it whose 1/f is off by as much as must be expected."""
+    camera = replace(choice.camera, bend=choice.camera.bend * np.exp(choice.doubt))
+    instances = replace(prepare(rows, params, camera), cell=instances.cell)
+    nodes = pool(instances, params)
+    start = gaussian.gradients(gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy)), solution.a)
+    height = heights(instances, nodes, camera, spacing)
+    field = replace(gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy)), energies=field.energies)
+    w, covariance, weight, smooth, noise = nodes.w, nodes.covariance, nodes.weight, solution.smooth, solution.noise
+    found = refine.refine(field, w, covariance, weight, start, smooth, 2, height, noise, solution.height_noise, tune=False)
+    return confidence.Other(camera, found.a)
 
 
 def heights(
@@ -323,7 +352,7 @@ def recalibrate(
     )
     if not np.array_equal(found.e, instances.calibration.e):
         instances = replace(instances, calibration=found)
-        nodes = pool(instances, spacing, params)
+        nodes = pool(instances, params)
         field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
         start, smooth = gaussian.gradients(field, solution.a), solution.smooth
         solution = refine.refine(
@@ -332,12 +361,30 @@ def recalibrate(
     return instances, nodes, *refine.refine_locally(field, nodes.w, nodes.covariance, nodes.weight, solution, height)
 
 
-def pool(instances: Instances, spacing: float, params: Params) -> pooling.Nodes:
-    """Nodes of cells of `spacing` px."""
+def pool(instances: Instances, params: Params) -> pooling.Nodes:
+    """Nodes of the instances' cells."""
     robust = instances.trust * np.minimum(instances.calibration.weight, 1)
     return pooling.pool(
-        instances.xy, instances.calibration.w, instances.covariance, robust, spacing, params.model_error
+        instances.xy, instances.calibration.w, instances.covariance, robust, instances.cell, params.model_error
     )
+
+
+def quartered(
+    instances: Instances, nodes: pooling.Nodes, grid: spline.Grid, a: Float, camera: perspective.Camera
+) -> Instances:
+    """The instances with the cells of those `nodes` quartered in which the surface of coefficients `a` (M,) turns by more than
+    `TURN` of what the node knows."""
+    index, stencil = camera.stencil(grid, instances.xy)
+    seen, _ = tensors.predict(np.einsum("npk,nk->np", stencil, a[index]))
+    used = nodes.member >= 0
+    node, count = nodes.member[used], len(nodes.xy)
+    number = np.bincount(node, minlength=count)
+    mean = np.stack([np.bincount(node, seen[used, k], count) / number for k in range(2)], 1)
+    spread = np.bincount(node, ((seen[used] - mean[node]) ** 2).sum(1), count) / number
+    wide = spread > TURN**2 * np.trace(nodes.covariance, axis1=1, axis2=2)
+    cell = instances.cell.copy()
+    cell[used] = np.where(wide[node], 0.5, 1.0) * cell[used]
+    return replace(instances, cell=cell)
 
 
 def choose_camera(
@@ -439,26 +486,21 @@ def outputs(
     field: gaussian.Field,
     spacing: float,
     camera: perspective.Camera,
-    crowded: float,
+    other: confidence.Other | None,
 ) -> Arrays:
-    """Dense maps and instances.
-
-    The posterior's covariance is multiplied by `crowded`: nodes in cells under `spacing` px share the errors of a motif, and
-    are not as many witnesses as they are.
-    """
+    """Dense maps and instances."""
     table = instances.table
     index, stencil = camera.stencil(field.grid, instances.xy)
     g = np.einsum("npk,nk->np", stencil, solution.a[index])
     k, found = instances.trust > 0, instances.calibration
     residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
     moved = confidence.influence(field, solution, nodes, residual, instances.texton)
-    diagonal, below = blocks.selected_inverse(solution.factor)
-    inverse = crowded * diagonal, crowded * below
+    inverse = blocks.selected_inverse(solution.factor)
     errors = confidence.Errors(
-        instances.xy[k], residual[k], chi2[k], found.common, moved, field.grid, inverse, camera
+        instances.xy[k], residual[k], chi2[k], found.common, moved, field.grid, inverse, camera, other
     )
     spread = confidence.spread(errors, instances.xy, g)
-    sigma = tensors.angular_error(g, spread)
+    sigma = np.hypot(tensors.angular_error(g, spread), confidence.turned(errors, instances.xy, g))
     normal = resolve(instances, g)
     off = np.linalg.norm(normal - tensors.normals(g), axis=1)  # in radians, but for a third order
     state = posterior_states(instances, g, spread)
@@ -553,4 +595,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=11, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=12, params=Params, run=run, inputs=("image", "frontal", "enrich"))

@@ -347,14 +347,14 @@ def ripples(xy):
     return np.stack((0.9 * np.cos(xy[..., 0] / 9), 0.3 * np.sin(xy[..., 1] / 40)), -1)
 
 
-def test_a_surface_as_rough_as_nodes_are_apart_is_looked_at_more_closely(monkeypatch):
+def test_cells_in_which_the_surface_turns_are_quartered(monkeypatch):
     xy = jittered(SHAPE, 9)
     n = tensors.normals(ripples(xy))
     light = 0.5 + 0.4 * n[:, 2] - 0.35 * n[:, 1] + 0.25 * n[:, 0]
     parts = instances_of((xy, ripples(xy)), noise=0.01, light=light)
     params = surface.Params(finalists=1, camera="orthographic", nodes=500)
     close = surface.run({"image": image(), "frontal": parts}, params)
-    monkeypatch.setattr(surface, "ROUGH", 0.0)
+    monkeypatch.setattr(surface, "TURN", np.inf)
     far = surface.run({"image": image(), "frontal": parts}, params)
     off = [np.median(angles(out, ripples)) for out in (close, far)]
     assert off[0] < 0.9 * off[1] and close["energy"] != far["energy"]

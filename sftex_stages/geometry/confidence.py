@@ -7,10 +7,13 @@ modelled at all. The instances themselves show it, by their residuals against th
 - texton by texton, in what each moves the surface (the cluster-robust covariance of Liang & Zeger 1986: `influence`);
 - nearby, in their scatter (the noise there) and in their mean (what the surface does not follow).
 
+Under perspective the focal length is known only so well: what the surface would be under another goes in as it is.
+
 What all textons have wrong together shows in no residual; `calibration.py` estimates it.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,14 +25,22 @@ from sftex_stages.geometry import blocks, gaussian, perspective, pooling, refine
 Float = NDArray[np.floating]
 Int = NDArray[np.integer]
 
-NEAR = 24  # instances that speak for a place
+NEAR, WIDE = 24, 256  # instances that speak for a place; and for its surroundings
 UPPER_QUARTILE = float(np.log(4.0))  # of half a chi-square of two degrees of freedom
 NOISE_FACTORS = (0.005, 20.0)
-# Textons on one printed motif err together, so that half as many are independent; the posterior's own share also stands for
-# what lies between instances; of what instances nearby err in common half is their own (they often lie on one motif), and half
-# the surface's. Round numbers, the same for all images; chosen among some forty settings on twelve images.
-TEXTONS, POSTERIOR, MISFIT = 2.0, 1.5, 0.5
+# Textons on one printed motif err together, so that fewer are independent; of what instances nearby err in common a quarter is
+# the surface's, the rest their own (they often lie on one motif). Round numbers, the same for all images; chosen among some
+# hundred settings on the benchmark's images and forty scenes drawn at random.
+TEXTONS, MISFIT = 1.5, 0.25
 CHUNK = 4096  # places at a time: bounded memory
+
+
+@dataclass(frozen=True)
+class Other:
+    """The surface, coefficients `a` (M,), under another `camera` that may as well be the right one."""
+
+    camera: perspective.Camera
+    a: Float
 
 
 @dataclass(frozen=True)
@@ -46,6 +57,27 @@ class Errors:
     grid: spline.Grid
     inverse: tuple[Float, Float]
     camera: perspective.Camera = perspective.ORTHOGRAPHIC
+    other: Other | None = None
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.xy)
+
+    @cached_property
+    def misfit(self) -> float:
+        """Root mean square, over the image, of what instances nearby err in common."""
+        if not len(self.xy):
+            return 0.0
+        at = self.xy[:: max(1, len(self.xy) // CHUNK)]
+        near = self.tree.query(at, min(NEAR, len(self.xy)))[1].reshape(len(at), -1)
+        return float(np.sqrt((np.median(self.residual[near], axis=1) ** 2).mean()))
+
+    def noise(self, at: Float) -> Float:
+        """Factor (P,) on the stated noise that the residuals show about `at` (P, 2): of those next to it and of those in the
+        surroundings, the geometric mean. What few of them show is itself uncertain."""
+        near = self.tree.query(at, min(WIDE, len(self.xy)))[1].reshape(len(at), -1)
+        shown = [np.quantile(self.chi2[near[:, :k]], 0.75, axis=1) / UPPER_QUARTILE for k in (NEAR, WIDE)]
+        return np.clip(np.sqrt(shown[0] * shown[1]), *NOISE_FACTORS)
 
 
 def residuals(w: Float, covariance: Float, g: Float) -> tuple[Float, Float]:
@@ -83,22 +115,27 @@ def influence(f: gaussian.Field, solution: refine.Solution, nodes: pooling.Nodes
 
 def spread(e: Errors, at: Float, g: Float) -> Float:
     """Covariance (P, 2, 2) to expect of slopes `g` (P, 2) relative to the rays of `at` (P, 2) px."""
-    tree = cKDTree(e.xy) if len(e.xy) else None
-    parts = [_spread(e, tree, at[k : k + CHUNK], g[k : k + CHUNK]) for k in range(0, len(at), CHUNK)]
+    parts = [_spread(e, at[k : k + CHUNK], g[k : k + CHUNK]) for k in range(0, len(at), CHUNK)]
     return np.concatenate(parts) if parts else np.zeros((0, 2, 2))
 
 
-def _spread(e: Errors, tree: cKDTree | None, at: Float, g: Float) -> Float:
+def turned(e: Errors, at: Float, g: Float) -> Float:
+    """Angle (P,) in radians between the normals of slopes `g` (P, 2) at `at` (P, 2) px and those of the other camera."""
+    if e.other is None:
+        return np.zeros(len(at))
+    index, stencil = e.other.camera.stencil(e.grid, at)
+    theirs = e.other.camera.turn(at, tensors.normals(np.einsum("npk,nk->np", stencil, e.other.a[index])))
+    return np.linalg.norm(e.camera.turn(at, tensors.normals(g)) - theirs, axis=-1)
+
+
+def _spread(e: Errors, at: Float, g: Float) -> Float:
     index, stencil = e.camera.stencil(e.grid, at)
     posterior = blocks.covariance(e.inverse, index, stencil, stencil)
-    if tree is None:
-        return POSTERIOR * posterior + tensors.common_error(g, e.common)
-    near = tree.query(at, min(NEAR, len(e.xy)))[1].reshape(len(at), -1)
-    noise = np.clip(np.quantile(e.chi2[near], 0.75, axis=1) / UPPER_QUARTILE, *NOISE_FACTORS)
-    misfit = MISFIT * np.sqrt((np.median(e.residual[near], axis=1) ** 2).mean(1))
+    if not len(e.xy):
+        return posterior + tensors.common_error(g, e.common)
     rows = np.arange(0, 2 * index.size + 1, 16)
     design = sp.csr_matrix((stencil.ravel(), np.repeat(index, 2, 0).ravel(), rows), shape=(2 * len(at), e.grid.size))
     moved = np.asarray(design @ e.influence).reshape(len(at), 2, -1)
     shared = TEXTONS * moved @ np.swapaxes(moved, 1, 2)
-    own = POSTERIOR * noise[:, None, None] * posterior
-    return np.asarray(shared + own + tensors.common_error(g, np.hypot(misfit, e.common)))
+    own = e.noise(at)[:, None, None] * posterior
+    return np.asarray(shared + own + tensors.common_error(g, np.hypot(MISFIT * e.misfit, e.common)))

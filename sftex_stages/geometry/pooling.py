@@ -28,14 +28,18 @@ class Nodes:
     share: Float
 
 
-def cells(xy: Float, cell: float) -> Int:
-    """Number (N,) of the square cell of `cell` px that every point lies in, occupied cells only, from 0."""
-    key = np.floor((xy - xy.min(0)) / cell).astype(np.int64)
-    return np.unique(key[:, 0] * (key[:, 1].max() + 1) + key[:, 1], return_inverse=True)[1].astype(np.int64)
+def cells(xy: Float, cell: float | Float) -> Int:
+    """Number (N,) of the square cell of `cell` px, (N,) or of all, that every point lies in: occupied cells only, from 0.
+
+    Cells of different sizes are different cells.
+    """
+    size = np.broadcast_to(cell, len(xy))
+    key = np.column_stack((size, np.floor((xy - xy.min(0)) / size[:, None])))
+    return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
-def pool(xy: Float, w: Float, covariance: Float, trust: Float, cell: float, floor: float) -> Nodes:
-    """Pool instances with positive `trust` (N,) in square cells of `cell` px.
+def pool(xy: Float, w: Float, covariance: Float, trust: Float, cell: float | Float, floor: float) -> Nodes:
+    """Pool instances with positive `trust` (N,) in square cells of `cell` px, (N,) or of all.
 
     Parameters
     ----------
@@ -44,7 +48,7 @@ def pool(xy: Float, w: Float, covariance: Float, trust: Float, cell: float, floo
         standard deviation of w that no crowd can average away: curvature within the cell, errors the textons share.
     """
     used = np.flatnonzero(trust > 0.1)
-    cellnumber = cells(xy[used], cell)
+    cellnumber = cells(xy[used], np.broadcast_to(cell, len(xy))[used])
     count = int(cellnumber.max()) + 1
     precision = np.linalg.inv(covariance[used])
     robust = np.ones(len(used))

@@ -12,7 +12,7 @@ Float = NDArray[np.floating]
 GAPS = 4.0  # reach of a measurement, in the typical (median) distance of a point from its nearest measurement
 BEYOND = 0.5  # of that reach, where measurements lie on one side only: past a border, or a silhouette
 ENCLOSED = 2.0  # the same where the surface is supported all around
-WORST = 30.0  # degrees; a normal less certain than this is not reported
+WORST = 20.0  # degrees; a normal less certain than this is not reported
 
 
 def typical_gap(xy: Float, spacing: float) -> float:
@@ -78,7 +78,8 @@ def dense(
     slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
     slope = camera.slopes(points, slope)
     spread = confidence.spread(errors, points, slope)
-    sigma = np.degrees(tensors.angular_error(slope, spread)).reshape(len(at_y), len(at_x))
+    sigma = np.hypot(tensors.angular_error(slope, spread), confidence.turned(errors, points, slope))
+    sigma = np.degrees(sigma).reshape(len(at_y), len(at_x))
     height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(f.grid, xy)
     seen = np.concatenate((xy, (stencil * a[index]).sum(1, keepdims=True)), 1)

@@ -170,15 +170,18 @@ def test_noise_and_misfit_nearby_widen_the_spread():
     g = np.tile([0.8, 0.3], (len(xy), 1))
     size = np.where(xy[:, 0] < 200, 0.02, 0.06)
     w = tensors.predict(g)[0] + size[:, None] * rng.normal(size=xy.shape)
-    w[xy[:, 1] > 300] += 0.05
     residual, chi2 = confidence.residuals(w, stated, g)
     inverse = blocks.selected_inverse(s.factor)
     e = confidence.Errors(xy, residual, chi2, 0.0, np.zeros((f.grid.size, 1)), f.grid, inverse)
     at = np.array([[100.0, 100], [300.0, 100], [100.0, 380]])
-    quiet, noisy, misfit = (np.trace(c) for c in confidence.spread(e, at, g[:3]))
-    assert quiet < noisy < misfit
-    shared = tensors.common_error(g[:1], confidence.MISFIT * 0.05)[0]
-    assert abs(misfit / np.trace(shared) - 1) < 0.5
+    quiet, noisy, _ = (np.trace(c) for c in confidence.spread(e, at, g[:3]))
+    # three times the noise, in a place and its surroundings
+    assert 4 < noisy / quiet < 13
+    off = dataclasses.replace(e, residual=residual + 0.05)  # in common everywhere, which the noise does not show
+    assert abs(off.misfit / 0.05 - 1) < 0.1 and e.misfit < 0.02
+    both = [confidence.spread(x, at, g[:3]) for x in (e, off)]
+    shared = [tensors.common_error(g[:3], confidence.MISFIT * x.misfit) for x in (e, off)]
+    assert np.allclose(both[1] - both[0], shared[1] - shared[0], rtol=1e-6)
     beside = dataclasses.replace(e, common=0.1)
     assert np.allclose(confidence.spread(beside, at, g[:3]) - confidence.spread(e, at, g[:3]),
                        tensors.common_error(g[:3], 0.1), rtol=1e-6)  # fmt: skip

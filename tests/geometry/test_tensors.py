@@ -112,3 +112,13 @@ def test_pooling_averages_a_crowd_and_resists_its_outlier():
     assert np.abs(nodes.w[0] - [0.3, -0.2]).max() < 0.01
     mean, variance = pooling.average(w[:, 0], np.full(30, 1e-4), nodes, np.ones(30), 0.0)
     assert abs(mean[0] - 0.3) < 0.01 and 1e-6 < variance[0] < 1e-3
+
+
+def test_cells_of_two_sizes_nest():
+    xy = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), -1).reshape(-1, 2)
+    even = pooling.cells(xy, 4.0)
+    assert (np.bincount(even) == 16).all() and len(np.bincount(even)) == 4
+    size = np.where(even == 0, 2.0, 4.0)
+    mixed = pooling.cells(xy, size)
+    assert sorted(np.bincount(mixed)) == [4, 4, 4, 4, 16, 16, 16]
+    assert all(len(set(even[mixed == k])) == 1 for k in range(7))
