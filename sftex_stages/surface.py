@@ -180,7 +180,8 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     calibrated, its sign resolved; normal_sigma, what it is off the surface and the surface off the truth; texton; state,
     posteriors of {as delivered, the other sign, not from the surface}; sign_margin, nats by which the best rival pattern
     is worse that differs there (NaN: not used).
-    camera "orthographic" or "perspective", with focal_px (inf if orthographic) and principal_point (x, y).
+    camera "orthographic" or "perspective", with focal_px (inf if orthographic), its standard deviation focal_sigma px (0 if it
+    was given, or if orthographic) and principal_point (x, y).
     Of the pieces, (P,) each: vote/…, nats by which cues prefer the sign taken to the other (`mirror.py`): scale, light,
     bulge, hint, smoothness (the other pieces), and shading, by which a piece is tied to the light; mirror_margin, nats by
     which the sign taken beats the other; region_margin, nats by which the best rival pattern is worse that turns
@@ -234,6 +235,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     other = doubted(rows, instances, fine, solution, choice, spacing, params) if choice.doubt else None
     results = outputs(mask, instances, nodes, solution, fine, spacing, camera, other)
     results["instance/sign_margin"] = margin.astype(np.float32)
+    results["focal_sigma"] = np.array(choice.doubt / camera.bend if choice.doubt else 0.0)
     results |= verdict.by_piece(results["piece"], before, found, regions, rise)
     return results | record(candidates, found.mirrored)
 
@@ -595,4 +597,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=12, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=13, params=Params, run=run, inputs=("image", "frontal", "enrich"))

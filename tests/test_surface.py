@@ -191,6 +191,7 @@ def test_element_sizes_give_focal_length_sign_and_normals_in_the_cameras_frame(s
     out = surface.run({"image": image(), "frontal": parts}, surface.Params(camera=chosen))
     assert str(out["camera"]) == "perspective"
     assert float(out["focal_px"]) == pytest.approx(500, rel=1e-9 if given else 0.1)
+    assert (float(out["focal_sigma"]) == 0) == given and float(out["focal_sigma"]) < 100
     assert tuple(out["principal_point"]) == camera.centre
     assert out["vote/scale"].shape == (1,) and out["vote/scale"][0] > 50
     at = np.rint(xy).astype(int)

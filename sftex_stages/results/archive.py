@@ -82,7 +82,8 @@ class Result:
 
     H × W pixels, P pieces, N instances, K textons. `instances` and `textons` are keyed by the names after the slash.
     `focal_px` and `principal_point` (x, y) are None under an orthographic camera. `attributes` has everything else:
-    image_name, image_sha256, config_yaml, keys and versions (these two as dictionaries), schema, schema_version, axes.
+    image_name, image_sha256, config_yaml, keys and versions (these two as dictionaries), schema, schema_version, axes, and under
+    a perspective camera focal_sigma, the standard deviation of focal_px (0 if it was given).
     """
 
     path: Path
@@ -143,12 +144,14 @@ def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any])
 
 
 def _camera(surface: Any) -> dict[str, Any]:
-    """The attributes `camera`, "orthographic" or "perspective"; the latter with `focal_px` and `principal_point` (x, y)."""
+    """The attributes `camera`, "orthographic" or "perspective"; the latter with `focal_px`, its expected error `focal_sigma`, and
+    `principal_point` (x, y)."""
     camera = str(surface["camera"])
     if camera != "perspective":
         return {"camera": camera}
     centre = np.asarray(surface["principal_point"], float)
-    return {"camera": camera, "focal_px": float(surface["focal_px"]), "principal_point": centre}
+    focal = {name: float(surface[name]) for name in ("focal_px", "focal_sigma")}
+    return {"camera": camera, **focal, "principal_point": centre}
 
 
 def _collect(arrays: Mapping[str, Any]) -> Arrays:

@@ -93,11 +93,13 @@ def test_textons_beyond_the_last_used_one_have_no_class_scale(tmp_path: Path, ar
 
 def test_perspective_results_give_their_camera(tmp_path: Path, arrays: dict, meta: dict) -> None:
     arrays["surface"] |= {
-        "camera": np.array("perspective"), "focal_px": np.array(900.0), "principal_point": np.array([64.5, 44.5])
+        "camera": np.array("perspective"), "focal_px": np.array(900.0), "principal_point": np.array([64.5, 44.5]),
+        "focal_sigma": np.array(30.0),
     }  # fmt: skip
     (tmp_path / "r.h5").write_bytes(archive.encode(arrays, meta))
     result = archive.open_result(tmp_path / "r.h5")
     assert (result.camera, result.focal_px, result.principal_point) == ("perspective", 900.0, (64.5, 44.5))
+    assert result.attributes["focal_sigma"] == 30.0
 
 
 def _replace(name: str, make: Callable[[h5py.File, Path], Any]) -> Callable[[Path], None]:
