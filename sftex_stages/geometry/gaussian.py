@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
 
 from sftex_stages.geometry import blocks, spline
 
@@ -95,7 +96,23 @@ def prior(f: Field, smooth: Smoothness) -> Float:
 def reasonable(f: Field, strength: float, reach: float) -> bool:
     """Whether a prior is within what the grid can show and double precision can hold."""
     extent = max(f.grid.cells) * f.grid.spacing
-    return 1e-3 <= strength <= 1e5 and 0.05 * f.grid.spacing <= reach <= 0.6 * extent
+    inside = 1e-3 <= strength <= 1e5 and 0.05 * f.grid.spacing <= reach <= 0.6 * extent
+    return inside and holds(f, Smoothness(strength, reach))
+
+
+def holds(f: Field, smooth: Smoothness) -> bool:
+    """Whether double precision holds the prior: a stiff one on a fine grid has next to no say about a lean."""
+    try:
+        return np.isfinite(prior_logdet(f, smooth))
+    except LinAlgError:
+        return False
+
+
+def softened(f: Field, smooth: Smoothness) -> Smoothness:
+    """The smoothness, or the stiffest below it that double precision holds."""
+    while not holds(f, smooth):
+        smooth = replace(smooth, strength=smooth.strength / 2)
+    return smooth
 
 
 def prior_logdet(f: Field, smooth: Smoothness) -> float:

@@ -235,7 +235,7 @@ def choose(
     if bend is None:
         rough = gaussian.make_field(grid, xy)
         firm = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
-        factor = gaussian.posterior(rough, firm, gaussian.prior(rough, smooth))
+        factor = gaussian.posterior(rough, firm, gaussian.prior(rough, gaussian.softened(rough, smooth)))
         h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
         follow = sizes.follow(w, h)
         hint = float(np.sign(follow)) * max(abs(follow) - CHANCE, 0.0)

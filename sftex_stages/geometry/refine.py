@@ -98,7 +98,7 @@ def refine(
     """
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
-    noise = float(np.clip(noise, *NOISE_FACTORS))
+    smooth, noise = gaussian.softened(f, smooth), float(np.clip(noise, *NOISE_FACTORS))
     x, pace = np.log([smooth.strength, smooth.reach, noise]), np.array([0.7, 0.7, 0.7])
     if height is not None:
         x, pace = np.append(x, np.log(height_noise)), np.append(pace, 0.7)

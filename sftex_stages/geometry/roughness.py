@@ -91,7 +91,10 @@ def learn(f: gaussian.Field, a: Float, factor: blocks.Factor, smooth: gaussian.S
             rate[k] = prior + np.bincount(level, others * found) / 2
             mean[k] = (shape[k] / rate[k])[level]
     bound = sum(_bound(n, s, r) for n, s, r in zip(number, shape, rate, strict=True))
-    return Roughness(mean.prod(0), bound)
+    product = mean.prod(0)
+    while product.max() > 1 and not gaussian.holds(shaped(f, product), smooth):
+        product = np.minimum(product, max(product.max() / 2, 1.0))
+    return Roughness(product, bound)
 
 
 def _bound(number: Float, shape: Float, rate: Float) -> float:

@@ -82,8 +82,8 @@ class Result:
 
     H × W pixels, P pieces, N instances, K textons. `instances` and `textons` are keyed by the names after the slash.
     `focal_px` and `principal_point` (x, y) are None under an orthographic camera. `attributes` has everything else:
-    image_name, image_sha256, config_yaml, keys and versions (these two as dictionaries), schema, schema_version, axes, and under
-    a perspective camera focal_sigma, the standard deviation of focal_px (0 if it was given).
+    image_name, image_sha256, config_yaml, keys and versions (these two as dictionaries), schema, schema_version, axes, and
+    under a perspective camera focal_sigma, the standard deviation of focal_px (0 if it was given).
     """
 
     path: Path
@@ -144,8 +144,8 @@ def encode(arrays: Mapping[str, Arrays | list[Arrays]], meta: Mapping[str, Any])
 
 
 def _camera(surface: Any) -> dict[str, Any]:
-    """The attributes `camera`, "orthographic" or "perspective"; the latter with `focal_px`, its expected error `focal_sigma`, and
-    `principal_point` (x, y)."""
+    """The attributes `camera`, "orthographic" or "perspective"; the latter with `focal_px`, its expected error `focal_sigma`
+    and `principal_point` (x, y)."""
     camera = str(surface["camera"])
     if camera != "perspective":
         return {"camera": camera}

@@ -102,3 +102,22 @@ def test_a_fold_beside_flat_cloth_is_rough_and_the_cloth_is_not():
     off = [np.linalg.norm(s.gradient - g - 0.5, axis=1) for s in (plain, local)]
     assert np.median(off[1][~fold]) < np.median(off[0][~fold])
     assert np.isfinite(shaped.energies[2]).all()
+
+
+def test_stiff_priors_stay_within_double_precision():
+    """A plane is as stiff as may be: the lean, which only weak terms hold, must not be lost in rounding."""
+    side, count = 15.0, 80
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(0, side * count, (400, 2))
+    f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, side * count), side), xy)
+    stiff = gaussian.Smoothness(1e5, 0.6 * side * count)
+    everywhere = roughness.shaped(f, np.full(len(roughness.cells(f.grid)), 36.0))
+    assert not gaussian.holds(everywhere, stiff) and not gaussian.reasonable(everywhere, 1e5, 0.6 * side * count)
+    assert gaussian.holds(everywhere, gaussian.softened(everywhere, stiff))
+    g = np.tile([0.8, 0.2], (len(xy), 1))
+    w, stated = tensors.predict(g)[0], np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
+    s = refine.refine(everywhere, w, stated, np.ones(len(xy)), g, stiff, 1, tune=False)
+    assert np.abs(s.gradient - g).max() < 1e-3
+    factor = gaussian.posterior(f, np.tile(1e4 * np.eye(2), (len(xy), 1, 1)), gaussian.prior(f, s.smooth))
+    learned = roughness.learn(f, np.zeros(f.grid.size), factor, s.smooth)
+    assert gaussian.holds(roughness.shaped(f, learned.factor), s.smooth)
