@@ -92,7 +92,7 @@ class Params(StageParams):
 
 
 TURN = 0.5  # of what a node knows: a cell in which the surface turns by more is quartered
-ROUNDS = 3  # of the first refinement
+ROUNDS = 3  # of a refinement that chooses smoothness and noise
 STEEP = 3.5  # slope (74 degrees) beyond which instances are not registered again any steeper: nothing is left of them
 
 
@@ -202,7 +202,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     instances = prepare(rows, params)
     used = instances.trust > 0
     box = instances.xy[used].min(0), instances.xy[used].max(0)
-    spacing = spacing_of(instances.xy[used], params.nodes)
+    spacing = float(instances.cell[0])  # the same for all, so far
     nodes = pool(instances, params)
     low, high = box[0] - 2 * spacing, box[1] + 2 * spacing
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
@@ -245,8 +245,7 @@ def look_again(
 ) -> Arrays:
     """The instances `rows` registered again as the surface of coefficients `a` (M,) shows them (`direct.py`)."""
     xy = rows["xy"].astype(float)
-    index, stencil = camera.stencil(grid, xy)
-    slope = refine.limit(np.einsum("npk,nk->np", stencil, a[index]), STEEP)
+    slope = refine.limit(camera.slopes_of(grid, a, xy), STEEP)
     p = direct.foreshortening(slope, camera, xy)
     rgb = inputs["image"]["rgb"]
     rows = {name: value.copy() for name, value in rows.items()}
@@ -301,7 +300,7 @@ def refit(
     height = heights(instances, nodes, camera, spacing)
     field = gaussian.make_field(grid, nodes.xy, stretch)
     w, covariance, weight = nodes.w, nodes.covariance, nodes.weight
-    solution = refine.refine(field, w, covariance, weight, start, solution.smooth, 3, height, solution.noise)
+    solution = refine.refine(field, w, covariance, weight, start, solution.smooth, ROUNDS, height, solution.noise)
     return instances, nodes, field, solution, height
 
 
@@ -318,9 +317,9 @@ def doubted(
     camera = replace(choice.camera, bend=choice.camera.bend * np.exp(choice.doubt))
     instances = replace(prepare(rows, params, camera), cell=instances.cell)
     nodes = pool(instances, params)
-    start = gaussian.gradients(gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy)), solution.a)
     height = heights(instances, nodes, camera, spacing)
     field = replace(gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy)), energies=field.energies)
+    start = gaussian.gradients(field, solution.a)
     w, covariance, weight, smooth, noise = nodes.w, nodes.covariance, nodes.weight, solution.smooth, solution.noise
     found = refine.refine(field, w, covariance, weight, start, smooth, 2, height, noise, solution.height_noise, tune=False)
     return confidence.Other(camera, found.a)
@@ -346,8 +345,7 @@ def recalibrate(
 ) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
     """Textons corrected by the surface, and the surface refined from them: one round of the alternation. Then the prior learns
     where the surface is rough."""
-    index, stencil = camera.stencil(field.grid, instances.xy)
-    seen, _ = tensors.predict(np.einsum("npk,nk->np", stencil, solution.a[index]))
+    seen, _ = tensors.predict(camera.slopes_of(field.grid, solution.a, instances.xy))
     transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
     found = calibration.against_surface(
         instances.calibration, transform, instances.covariance, instances.texton, instances.trust, seen
@@ -376,8 +374,7 @@ def quartered(
 ) -> Instances:
     """The instances with the cells of those `nodes` quartered in which the surface of coefficients `a` (M,) turns by more than
     `TURN` of what the node knows."""
-    index, stencil = camera.stencil(grid, instances.xy)
-    seen, _ = tensors.predict(np.einsum("npk,nk->np", stencil, a[index]))
+    seen, _ = tensors.predict(camera.slopes_of(grid, a, instances.xy))
     used = nodes.member >= 0
     node, count = nodes.member[used], len(nodes.xy)
     number = np.bincount(node, minlength=count)
@@ -492,8 +489,7 @@ def outputs(
 ) -> Arrays:
     """Dense maps and instances."""
     table = instances.table
-    index, stencil = camera.stencil(field.grid, instances.xy)
-    g = np.einsum("npk,nk->np", stencil, solution.a[index])
+    g = camera.slopes_of(field.grid, solution.a, instances.xy)
     k, found = instances.trust > 0, instances.calibration
     residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
     moved = confidence.influence(field, solution, nodes, residual, instances.texton)
@@ -502,7 +498,7 @@ def outputs(
         instances.xy[k], residual[k], chi2[k], found.common, moved, field.grid, inverse, camera, other
     )
     spread = confidence.spread(errors, instances.xy, g)
-    sigma = np.hypot(tensors.angular_error(g, spread), confidence.turned(errors, instances.xy, g))
+    sigma = confidence.angle(errors, instances.xy, g, spread)
     normal = resolve(instances, g)
     off = np.linalg.norm(normal - tensors.normals(g), axis=1)  # in radians, but for a third order
     state = posterior_states(instances, g, spread)

@@ -66,8 +66,6 @@ class Errors:
     @cached_property
     def misfit(self) -> float:
         """Root mean square, over the image, of what instances nearby err in common."""
-        if not len(self.xy):
-            return 0.0
         at = self.xy[:: max(1, len(self.xy) // CHUNK)]
         near = self.tree.query(at, min(NEAR, len(self.xy)))[1].reshape(len(at), -1)
         return float(np.sqrt((np.median(self.residual[near], axis=1) ** 2).mean()))
@@ -119,13 +117,14 @@ def spread(e: Errors, at: Float, g: Float) -> Float:
     return np.concatenate(parts) if parts else np.zeros((0, 2, 2))
 
 
-def turned(e: Errors, at: Float, g: Float) -> Float:
-    """Angle (P,) in radians between the normals of slopes `g` (P, 2) at `at` (P, 2) px and those of the other camera."""
+def angle(e: Errors, at: Float, g: Float, spread: Float) -> Float:
+    """Root mean square angle (P,) in radians to expect of the normals of slopes `g` (P, 2) of covariance `spread` (P, 2, 2) at
+    `at` (P, 2) px: in the camera's frame, and so with what the other camera makes of them."""
+    own = tensors.angular_error(g, spread)
     if e.other is None:
-        return np.zeros(len(at))
-    index, stencil = e.other.camera.stencil(e.grid, at)
-    theirs = e.other.camera.turn(at, tensors.normals(np.einsum("npk,nk->np", stencil, e.other.a[index])))
-    return np.linalg.norm(e.camera.turn(at, tensors.normals(g)) - theirs, axis=-1)
+        return own
+    theirs = e.other.camera.turn(at, tensors.normals(e.other.camera.slopes_of(e.grid, e.other.a, at)))
+    return np.asarray(np.hypot(own, np.linalg.norm(e.camera.turn(at, tensors.normals(g)) - theirs, axis=-1)))
 
 
 def _spread(e: Errors, at: Float, g: Float) -> Float:

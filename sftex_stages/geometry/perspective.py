@@ -25,8 +25,8 @@ SCREEN = 25.0  # nats by which sizes must follow the heights seen under orthogra
 CHANCE = 20.0  # nats that orthographic scenes reach by themselves: what sizes say beyond them leans to a sign
 FREEDOM = 4.0  # of the Student distribution of sizes in that
 ROUNDS = 4  # of refinement for each camera tried
-DOUBT, MOST_DOUBT = 2.0, 0.5  # times what the curvature of that says of log 1/f, for the same reason; and the most of it
 GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
+DOUBT, MOST_DOUBT = 2.0, 0.5  # times what the curvature of these says of log 1/f, for the same reason; and the most of it
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,11 @@ class Camera:
         index, p = spline.stencil(grid, xy, 1, 0)
         both = np.stack((p, spline.stencil(grid, xy, 0, 1)[1]), 1)
         return index, both if self.bend == 0 else self.stretch(xy) @ both
+
+    def slopes_of(self, grid: spline.Grid, a: Float, xy: Float) -> Float:
+        """Slopes (N, 2) relative to the rays of `xy` (N, 2) px, of the surface of coefficients `a` (M,)."""
+        index, stencil = self.stencil(grid, xy)
+        return np.einsum("npk,nk->np", stencil, a[index])
 
     def slopes(self, xy: Float, g: Float) -> Float:
         """K g (…, 2) of gradients g (…, 2) at `xy` (…, 2)."""

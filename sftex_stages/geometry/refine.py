@@ -99,6 +99,7 @@ def refine(
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
     smooth, noise = gaussian.softened(f, smooth), float(np.clip(noise, *NOISE_FACTORS))
+    noises, rises = np.log(NOISE_FACTORS), np.log(HEIGHT_FACTORS)
     x, pace = np.log([smooth.strength, smooth.reach, noise]), np.array([0.7, 0.7, 0.7])
     if height is not None:
         x, pace = np.append(x, np.log(height_noise)), np.append(pace, 0.7)
@@ -108,9 +109,9 @@ def refine(
 
     def score(x: Float) -> float:
         strength, reach, noise = map(float, np.exp(x[:3]))
-        if not gaussian.reasonable(f, strength, reach) or not NOISE_FACTORS[0] * (1-1e-9) <= noise <= NOISE_FACTORS[1]:
+        if not gaussian.reasonable(f, strength, reach) or not noises[0] <= x[2] <= noises[1]:
             return -np.inf
-        if height is not None and not HEIGHT_FACTORS[0] <= np.exp(x[3]) <= HEIGHT_FACTORS[1]:
+        if height is not None and not rises[0] <= x[3] <= rises[1]:
             return -np.inf
         information, pull, constant = linearise(w, precision * (robust / noise)[:, None, None], g)
         return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach), rise(x))
@@ -146,7 +147,7 @@ def refine_locally(
     """
     shaped = f
     for rounds in LOCAL_ROUNDS:
-        shaped = roughness.shaped(f, roughness.learn(f, found.a, found.factor, found.smooth).factor)
+        shaped = roughness.learn(f, found.a, found.factor, found.smooth).field
         start, smooth, noise = found.gradient, found.smooth, found.noise
         found = refine(shaped, w, covariance, trust, start, smooth, rounds, height, noise, found.height_noise, tune=False)
     return shaped, found

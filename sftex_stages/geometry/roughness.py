@@ -31,10 +31,12 @@ SWEEPS = 8  # of the levels in turn
 
 
 class Roughness(NamedTuple):
-    """Factors λ (C,) of the cells, and what the bound of the evidence has beyond the evidence at λ, nats: their cost."""
+    """Factors λ (C,) of the cells, what the bound of the evidence has beyond the evidence at λ, nats: their cost; and the field
+    with that prior."""
 
     factor: Float
     bound: float
+    field: gaussian.Field
 
 
 def cells(grid: spline.Grid) -> Int:
@@ -92,9 +94,11 @@ def learn(f: gaussian.Field, a: Float, factor: blocks.Factor, smooth: gaussian.S
             mean[k] = (shape[k] / rate[k])[level]
     bound = sum(_bound(n, s, r) for n, s, r in zip(number, shape, rate, strict=True))
     product = mean.prod(0)
-    while product.max() > 1 and not gaussian.holds(shaped(f, product), smooth):
+    field = shaped(f, product)
+    while product.max() > 1 and not gaussian.holds(field, smooth):
         product = np.minimum(product, max(product.max() / 2, 1.0))
-    return Roughness(product, bound)
+        field = shaped(f, product)
+    return Roughness(product, bound, field)
 
 
 def _bound(number: Float, shape: Float, rate: Float) -> float:

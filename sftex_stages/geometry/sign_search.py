@@ -318,14 +318,13 @@ def disputed(patterns: Float, trust: Float, pairs: tuple[Int, Int]) -> Int:
 def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool) -> Candidate:
     """One pass of `reconsider`; the `last` one states the evidence at the roughness of the surface found."""
     c = own_coupling(data, f, x)
-    rough = roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth).factor
-    x = replace(x, rough=rough)
-    shaped = roughness.shaped(f, rough)
+    learned = roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth)
+    x = replace(x, rough=learned.factor)
     if 0 < label.max() < MOST_REGIONS:
         c = own_coupling(data, f, x)
         x = replace(x, s=signs.flip_regions(c, x.s, bias_of(data, x.s[:, None], np.ones(1, bool), [None])[:, 0], label))
     s = settle(data, f, x)
-    x = replace(judge(data, shaped, s, x.smooth, x.noise, 2, x.origin), rough=rough)
+    x = replace(judge(data, learned.field, s, x.smooth, x.noise, 2, x.origin), rough=learned.factor)
     if not last:
         return x
     c = own_coupling(data, f, x)

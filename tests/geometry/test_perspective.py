@@ -90,7 +90,7 @@ def problem(view, noise, true):
     if true.bend:
         w, log_scale = seen(perspective.Camera(CENTRE, 0.0), xy, transform)
     else:
-        w, log_scale = tensors.predict(slope)[0], 0.03 * np.hypot(*tensors.predict(slope)[0].T)  # size follows slant
+        w, log_scale = tensors.predict(slope)[0], 0.1 * np.hypot(*tensors.predict(slope)[0].T)  # size follows slant
     w = w + noise * rng.normal(size=w.shape)
     sizes = perspective.Sizes(
         log_scale + noise * rng.normal(size=len(xy)), np.full(len(xy), noise**2), np.ones(len(xy))
