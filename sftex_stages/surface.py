@@ -88,7 +88,9 @@ class Params(StageParams):
     direct: int = Field(
         0, ge=0, le=5, description="Rounds of the direct method: instances registered again as the surface shows them"
     )
-    finalists: int = Field(4, ge=1, le=50, description="Sign patterns that are compared by their full evidence")
+    finalists: int = Field(
+        4, ge=1, le=50, description="Sign patterns compared by their full evidence; up to four times as many if nodes are few"
+    )
 
 
 TURN = 0.5  # of what a node knows: a cell in which the surface turns by more is quartered
@@ -207,7 +209,9 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     low, high = box[0] - 2 * spacing, box[1] + 2 * spacing
     coarse = gaussian.make_field(spline.cover(low, high, spacing), nodes.xy)
     sizes = None if params.camera == "orthographic" else element_sizes(instances, nodes, spacing)
-    data = search_data(instances, nodes, sizes, spacing, params)
+    data = search_data(instances, nodes, spacing, params)
+    if sizes is not None:
+        data = replace(data, views=views(data, nodes, coarse.grid, sizes, inputs["image"], params))
     find = sign_search.search if params.method == "collapsed" else sign_search.by_em
     candidates = find(data, coarse, spacing, params.finalists, params.start)
     best = candidates[0]
@@ -397,16 +401,35 @@ def choose_camera(
 ) -> perspective.Choice:
     """The camera that is asked for, or the photograph's own, or told by element `sizes`; and what these say about the sign of
     `start` (M, 2)."""
+    centre, size, bend = frame(image, params)
+    if params.camera == "orthographic" or sizes is None:
+        return perspective.Choice(perspective.Camera(centre, bend or 0.0), 0.0, 0.0)
+    w, covariance = nodes.w, nodes.covariance
+    return perspective.choose(grid, nodes.xy, w, covariance, sizes, start, best.smooth, best.noise, centre, size, bend)
+
+
+def frame(image: Arrays, params: Params) -> tuple[Point, float, float | None]:
+    """Principal point (x, y) and longer side of the image, px, and 1/f, 1/px, if it is known."""
     shape = image["mask"].shape
-    centre = ((shape[1] - 1) / 2, (shape[0] - 1) / 2)
     bend = 1 / params.camera.focal_px if isinstance(params.camera, Pinhole) else None
     if params.camera == "auto" and "focal_px" in image:
         bend = 1 / float(image["focal_px"])
-    if params.camera == "orthographic" or sizes is None:
-        return perspective.Choice(perspective.Camera(centre, bend or 0.0), 0.0, 0.0)
-    size = float(max(shape))
-    w, covariance = nodes.w, nodes.covariance
-    return perspective.choose(grid, nodes.xy, w, covariance, sizes, start, best.smooth, best.noise, centre, size, bend)
+    return ((shape[1] - 1) / 2, (shape[0] - 1) / 2), float(max(shape)), bend
+
+
+def views(
+    data: sign_search.Data,
+    nodes: pooling.Nodes,
+    grid: spline.Grid,
+    sizes: perspective.Sizes,
+    image: Arrays,
+    params: Params,
+) -> tuple[sign_search.View, ...]:
+    """What the camera that is known would show, or those do that may have been there."""
+    centre, size, bend = frame(image, params)
+    bends = [k / size for k in perspective.TRIALS] if bend is None else [bend]
+    seen = [perspective.view(perspective.Camera(centre, k), nodes.xy, nodes.w, nodes.covariance, sizes) for k in bends]
+    return tuple(sign_search.seen_by(data, grid, view) for view in seen)
 
 
 def read_hints(params: HintParams, shape: tuple[int, int]) -> mirror.Hints:
@@ -459,10 +482,8 @@ def on_one_scale(
     )
 
 
-def search_data(
-    instances: Instances, nodes: pooling.Nodes, sizes: perspective.Sizes | None, spacing: float, params: Params
-) -> sign_search.Data:
-    """What the sign search is given: gradients up to sign, irradiance on one scale, and sizes."""
+def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, params: Params) -> sign_search.Data:
+    """What the sign search is given: gradients up to sign, and irradiance on one scale."""
     d, covariance = tensors.gradient(nodes.w, nodes.covariance)
     log_outlier = -np.log(np.pi) + 0.5 * (np.linalg.slogdet(nodes.covariance)[1] - np.linalg.slogdet(covariance)[1])
     light = instances.table["irradiance"].astype(float)
@@ -474,7 +495,7 @@ def search_data(
         e = np.exp(value)
         e, variance = e / e.mean(), variance * (e / e.mean()) ** 2
         cue = shading.make_shading(nodes.xy, e, variance, tensors.normals(d))
-    return sign_search.Data(nodes.xy, d, covariance, nodes.weight, log_outlier, cue, sizes)
+    return sign_search.Data(nodes.xy, d, covariance, nodes.weight, log_outlier, cue)
 
 
 def outputs(
@@ -593,4 +614,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=14, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=15, params=Params, run=run, inputs=("image", "frontal", "enrich"))

@@ -21,8 +21,7 @@ Float = NDArray[np.floating]
 TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
 OFF = (1.0, 0.01, 0.01)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
-SCREEN = 25.0  # nats by which sizes must follow the heights seen under orthography to be asked any further
-CHANCE = 20.0  # nats that orthographic scenes reach by themselves: what sizes say beyond them leans to a sign
+CHANCE = 10.0  # nats that orthographic scenes reach by themselves: sizes that say no more say nothing
 FREEDOM = 4.0  # of the Student distribution of sizes in that
 ROUNDS = 4  # of refinement for each camera tried
 GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
@@ -139,29 +138,46 @@ class Sizes:
         height = self.heights(ORTHOGRAPHIC, xy, w, change)
         return max((height.over(k).unrelated(), k) for k in np.geomspace(*refine.HEIGHT_FACTORS, 30).tolist())
 
-    def follow(self, w: Float, h: Float) -> float:
-        """Nats by which log size goes linearly with heights `h` (M,) px, beyond its constant and what the slant explains;
-        negative if what stands out is small.
-
-        Profile likelihoods of Student noise, one scale for all; `w` (M, 2) of the nodes.
-        """
+    def alike(self, value: Float, w: Float) -> tuple[float, float]:
+        """Log likelihood in nats of log sizes `value` (M,) that should all be the same but for what the slant explains, `w`
+        (M, 2) of the nodes: profile of Student noise, one factor on the variance for all; and that factor."""
         steep, root = np.hypot(w[:, 0], w[:, 1]), np.sqrt(self.trust / self.variance)
-        columns = np.stack((np.ones_like(h), steep, steep**2, h - h.mean()), 1) * root[:, None]
-        y, cost = self.value * root, []
-        for x in (columns[:, :3], columns):
-            weight, scale = np.ones(len(y)), 1.0
-            ridge = np.full(x.shape[1], 1e-12 * float((x**2).sum()))
-            ridge[1:3] += 1 / np.square(OFF[1:])
-            for _ in range(6):
-                heavy = x * weight[:, None]
-                c = np.linalg.solve(heavy.T @ x + np.diag(scale * ridge), heavy.T @ y)
-                r = y - x @ c
-                scale = max(float(np.average(r**2, weights=weight)), 1e-12)
-                weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
-            trials = scale * np.geomspace(0.05, 20, 40)
-            student = 0.5 * (FREEDOM + 1) * np.log1p(r[:, None] ** 2 / trials / FREEDOM) + 0.5 * np.log(trials)
-            cost.append(float(student.sum(0).min()))
-        return float(np.sign(c[-1]) * (cost[0] - cost[1]))
+        x = np.stack((np.ones_like(steep), steep, steep**2), 1) * root[:, None]
+        y, weight, scale = value * root, np.ones(len(value)), 1.0
+        ridge = np.append(1e-12 * float((x**2).sum()), 1 / np.square(OFF[1:]))
+        for _ in range(6):
+            heavy = x * weight[:, None]
+            r = y - x @ np.linalg.solve(heavy.T @ x + np.diag(scale * ridge), heavy.T @ y)
+            scale = max(float(np.average(r**2, weights=weight)), 1e-12)
+            weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
+        trials = scale * np.geomspace(0.05, 20, 40)
+        student = 0.5 * (FREEDOM + 1) * np.log1p(r[:, None] ** 2 / trials / FREEDOM) + 0.5 * np.log(trials)
+        cost = student.sum(0)
+        return -float(cost.min()), float(trials[cost.argmin()])
+
+
+@dataclass(frozen=True)
+class View:
+    """Nodes as a camera shows them: w (M, 2), its covariance (M, 2, 2), the `change` (M,) of their log `sizes`; and the nats
+    (`Sizes.alike`) of one size for all, without that camera."""
+
+    camera: Camera
+    w: Float
+    covariance: Float
+    change: Float
+    sizes: Sizes
+    flat: float
+
+    def fit(self, h: Float) -> tuple[float, float]:
+        """Nats by which sizes are those of a surface of heights `h` (M,) px seen by this camera, rather than all the same; and
+        the factor on their variance that is left."""
+        told, noise = self.sizes.alike(self.sizes.value + self.change - self.camera.bend * h, self.w)
+        return told - self.flat, noise
+
+
+def view(camera: Camera, xy: Float, w: Float, covariance: Float, sizes: Sizes) -> View:
+    """Nodes at `xy` (M, 2) px, of w (M, 2) in the image and its covariance (M, 2, 2), as `camera` shows them."""
+    return View(camera, *flatten_tensors(camera, xy, w, covariance), sizes, sizes.alike(sizes.value, w)[0])
 
 
 def summit(found: dict[float, float]) -> tuple[float, float]:
@@ -182,8 +198,9 @@ def summit(found: dict[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Choice:
-    """A camera; nats by which it beats orthography; nats by which element size prefers sign +1 to −1 (0: it is blind),
-    under orthography those beyond `CHANCE`; standard deviation of log 1/f, 0 if it is known."""
+    """A camera; nats by which it beats orthography (all that sizes have for any camera, if it is orthography); nats by which
+    element size prefers sign +1 to −1 (0: it is blind), under orthography those beyond `CHANCE`; standard deviation of log 1/f,
+    0 if it is known."""
 
     camera: Camera
     gain: float
@@ -242,10 +259,11 @@ def choose(
         firm = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
         factor = gaussian.posterior(rough, firm, gaussian.prior(rough, gaussian.softened(rough, smooth)))
         h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
-        follow = sizes.follow(w, h)
-        hint = float(np.sign(follow)) * max(abs(follow) - CHANCE, 0.0)
-        if abs(follow) < SCREEN:
-            return Choice(Camera(centre, 0.0), abs(follow), hint)
+        views = [view(Camera(centre, trial / size), xy, w, covariance, sizes) for trial in TRIALS]
+        up, down = (max(0.0, *(v.fit(sign * h)[0] for v in views)) for sign in (1.0, -1.0))
+        if max(up, down) < CHANCE:
+            return Choice(Camera(centre, 0.0), max(up, down), 0.0)
+        hint = float(np.sign(up - down)) * max(abs(up - down) - CHANCE, 0.0)
     flat, scatter = sizes.unrelated(xy, w, np.zeros(len(w)))
     # All are judged from settings that suit the flat one: rounds enough to leave them, not to find them from afar.
     tuned = refine.refine(

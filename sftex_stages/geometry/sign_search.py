@@ -1,11 +1,13 @@
 """Many starts, several smoothnesses, every cue, one measure: the search for the sign pattern of greatest evidence.
 
 Every smoothness of a ladder, smooth to rough, anneals all starts (leading eigenvectors, the paper's cylinder in four
-directions, leaning planes, a bowl, the elements' sizes, lights from six azimuths), with and without shading, moves whole
-regions, and hands its patterns on as starts of the next. The best distinct patterns then flip regions of every size
-(`sign_regions.py`) and are judged by their evidence, each with its own best smoothness and noise and with outliers let go,
-so that patterns found with different settings compare. Those that come near the best are reconsidered under a prior that is
-rough where their surface is (`roughness.py`): one smoothness for all prefers patterns that iron folds out.
+directions, leaning planes, a bowl, lights from six azimuths), with and without shading, moves whole regions, and hands its
+patterns on as starts of the next. Under every camera that may have been there it does so as well from what the elements'
+sizes say of heights, which are in the energy then. The best distinct patterns flip regions of every size
+(`sign_regions.py`) and are judged by their evidence, each under the camera that sizes speak for, with its own best
+smoothness and noise and with outliers let go, so that patterns found with different settings compare. Those that come near
+the best are reconsidered under a prior that is rough where their surface is (`roughness.py`), too: one smoothness for all
+prefers patterns that iron folds out.
 """
 
 from dataclasses import dataclass, replace
@@ -24,6 +26,7 @@ from sftex_stages.geometry import (
     shading,
     sign_regions,
     signs,
+    spline,
     surface_em,
     tensors,
 )
@@ -35,17 +38,18 @@ Int = NDArray[np.integer]
 LADDER = ((3.0, 8.0), (1.0, 4.0), (1.0, 2.0), (1.0, 0.7))  # strength, reach in spacings of nodes
 EM_SPACING = 1.5  # of the radial functions, in spacings of nodes
 ANNEAL_STEPS, LIGHT_EVERY = 24, 6
+EXCESS = 0.7  # standard deviation of the log of a noise factor over 1: instances in a node agree, so it is not all noise
 OUTLIER = 0.05  # prior share of nodes that are not from the surface
 MOST_REGIONS = 400  # that patterns may differ in to be exchanged
+AFFORDED, MORE = 1200, 4  # nodes up to which there are more finalists, and times as many at most: where few tell little
 AFTERTHOUGHT, PASSES = 100.0, 2  # nats behind the best up to which a pattern is reconsidered, and how often
-SAY_OF_SIZES = 0.5  # of the nats beyond chance by which sizes follow heights: neighbours share errors of their size
-SIZES_NEAR = 60  # nodes whose sizes tell how they change about a place
 
 
 @dataclass(frozen=True)
 class Data:
     """Nodes at `xy` (N, 2) px: gradient up to sign `d` (N, 2), its covariance (N, 2, 2), belief `trust` (N,) in 0…1, log
-    density (N,) an outlier would have there; irradiance against normals, and sizes of the elements (None: no such cue)."""
+    density (N,) an outlier would have there; irradiance against normals, and measured heights (None: no such cue); and the
+    cameras that may have been there."""
 
     xy: Float
     d: Float
@@ -53,7 +57,17 @@ class Data:
     trust: Float
     log_outlier: Float
     shading: shading.Shading | None
-    sizes: perspective.Sizes | None = None
+    heights: gaussian.Heights | None = None
+    views: "tuple[View, ...]" = ()
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera shows: the nodes as it has them, with the heights that their sizes tell, on the field of its slopes."""
+
+    seen: perspective.View
+    data: Data
+    field: gaussian.Field
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,8 @@ class Candidate:
     origin: str
     tuned: bool  # whether smoothness and noise were searched for it, or are those it was found at
     rough: Float | None = None  # factors of the prior's cells (`roughness.py`)
+    view: View | None = None  # under which it was judged; None: orthography
+    height_noise: float = 1.0
 
     @property
     def evidence(self) -> float:
@@ -89,18 +105,13 @@ def starts(data: Data) -> tuple[Float, list[str]]:
     return np.where(np.concatenate(columns, 1) < 0, -1.0, 1.0), names
 
 
-def size_starts(data: Data) -> tuple[Float, list[str]]:
-    """Signs (N, 1) of a surface that rises where elements become larger, as perspective has it: none without sizes."""
-    if data.sizes is None or len(data.d) < SIZES_NEAR:
-        return np.zeros((len(data.d), 0)), []
-    near = cKDTree(data.xy).query(data.xy, SIZES_NEAR)[1]
-    offset = data.xy[near] - data.xy[:, None]
-    basis = np.concatenate((np.ones_like(offset[..., :1]), offset), 2)
-    weight = (data.sizes.trust / data.sizes.variance)[near]
-    normal = np.einsum("nk,nki,nkj->nij", weight, basis, basis)
-    right = np.einsum("nk,nki,nk->ni", weight, basis, data.sizes.value[near])
-    rise = np.linalg.solve(normal + 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3), right[..., None])
-    return np.where((rise[:, 1:, 0] * data.d).sum(1) < 0, -1.0, 1.0)[:, None], ["sizes"]
+def seen_by(data: Data, grid: spline.Grid, seen: perspective.View) -> View:
+    """The nodes of `data` as a camera has them."""
+    d, covariance = tensors.gradient(seen.w, seen.covariance)
+    d *= np.where((d * data.d).sum(1) < 0, -1.0, 1.0)[:, None]
+    heights = seen.sizes.heights(seen.camera, data.xy, seen.w, seen.change)
+    mine = replace(data, d=d, covariance=covariance, heights=heights, views=())
+    return View(seen, mine, gaussian.make_field(grid, data.xy, seen.camera.stretch(data.xy)))
 
 
 def lit_starts(data: Data) -> tuple[Float, list[str]]:
@@ -136,8 +147,16 @@ def patches(data: Data, pairs: tuple[Int, Int], level: float) -> Int:
     return np.unique(label[core][nearest], return_inverse=True)[1].astype(np.int64)
 
 
-def bias_of(data: Data, m: Float, lit: NDArray[np.bool_], lights: list[shading.Light | None]) -> Float:
-    """Fields (N, S) of the shading on patterns `m` (N, S) of which those in `lit` (S,) use it; refits `lights` in place."""
+def bias_of(
+    data: Data, c: signs.Coupling, m: Float, lit: NDArray[np.bool_], lights: list[shading.Light | None]
+) -> Float:
+    """Fields (N, S) of measured heights and, for those of the patterns `m` (N, S) in `lit` (S,), of shading; refits `lights` in
+    place."""
+    return c.lift[:, None] + lit_bias(data, m, lit, lights)
+
+
+def lit_bias(data: Data, m: Float, lit: NDArray[np.bool_], lights: list[shading.Light | None]) -> Float:
+    """Those of shading alone."""
     bias = np.zeros_like(m)
     if data.shading is not None:
         for k in np.flatnonzero(lit):
@@ -154,14 +173,23 @@ def rung(
     m = 0.7 * patterns
     betas = np.geomspace(hot, 1.0, ANNEAL_STEPS)
     for k in range(0, ANNEAL_STEPS, LIGHT_EVERY):
-        m = signs.anneal(c, m, bias_of(data, m, lit, lights), betas[k : k + LIGHT_EVERY])
+        m = signs.anneal(c, m, bias_of(data, c, m, lit, lights), betas[k : k + LIGHT_EVERY])
     s = np.where(m < 0, -1.0, 1.0)
     for label in [None, *labels]:
-        bias = bias_of(data, s, lit, lights)
+        bias = bias_of(data, c, s, lit, lights)
         if label is not None:
             s = np.stack([signs.flip_regions(c, s[:, j], bias[:, j], label) for j in range(s.shape[1])], 1)
         s = signs.descend(c, s, bias)
     return s
+
+
+def from_sizes(view: View, smooth: gaussian.Smoothness, labels: list[Int], hot: float) -> Float:
+    """Patterns (N, 1 or 2), without and with shading, that start from the surface which the elements' sizes make."""
+    data = view.data
+    weight = np.linalg.inv(data.covariance) * data.trust[:, None, None]
+    c = signs.coupling(view.field, data.d, weight, smooth, data.heights)
+    lit = np.arange(1 if data.shading is None else 2) > 0
+    return rung(data, c, np.where(c.lift < 0, -1.0, 1.0)[:, None].repeat(len(lit), 1), lit, labels, hot)
 
 
 def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
@@ -172,18 +200,36 @@ def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
     return max(light.log_likelihood - data.shading.null.log_likelihood - 2.0, 0.0), light
 
 
-def size_of(data: Data, h: Float) -> float:
-    """Nats that the elements' sizes give a surface of heights `h` (N,), or its mirror image: those beyond chance."""
-    if data.sizes is None:
-        return 0.0
-    told = abs(data.sizes.follow(tensors.predict(data.d)[0], h))
-    return SAY_OF_SIZES * max(told - perspective.CHANCE, 0.0)
+def size_of(data: Data, h: Float) -> tuple[float, View | None, float]:
+    """Nats, beyond chance, by which the elements' sizes are those of a surface of heights `h` (N,) or of its mirror image; the
+    view under which they are (None: they are all the same), and the sign of h."""
+    told = [(v.seen.fit(sign * h)[0] - perspective.CHANCE, k, sign) for k, v in enumerate(data.views) for sign in (1.0, -1.0)]
+    nats, k, sign = max(told, default=(0.0, 0, 1.0))
+    return (nats, data.views[k], sign) if nats > 0 else (0.0, None, 1.0)
+
+
+def judge_as_seen(data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, origin: str) -> Candidate:
+    """The evidence of pattern `s` (N,), or of its mirror image, under the camera that sizes speak for."""
+    plain = judge(data, f, s, smooth, 1.0, 0, origin)
+    _, view, sign = size_of(data, gaussian.heights(f, plain.a))
+    return plain if view is None else judge(view.data, view.field, sign * s, smooth, 1.0, 0, origin, view)
 
 
 def judge(
-    data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, noise: float, rounds: int, origin: str
+    data: Data,
+    f: gaussian.Field,
+    s: Float,
+    smooth: gaussian.Smoothness,
+    noise: float,
+    rounds: int,
+    origin: str,
+    view: View | None = None,
 ) -> Candidate:
-    """The evidence of pattern `s` (N,), tuning smoothness and noise for it and letting outliers go (variational bound)."""
+    """The evidence of pattern `s` (N,), tuning smoothness and noise for it and letting outliers go (variational bound).
+
+    `data` and `f` are those of the `view`, if there is one. The surface is that of the gradients alone: what sizes add is
+    measured by it.
+    """
     precision = np.linalg.inv(data.covariance)
     logdet = np.linalg.slogdet(precision)[1]
     y = data.d * s[:, None]
@@ -200,7 +246,7 @@ def judge(
         value = gaussian.log_evidence(f, weight, pull, gaussian.Smoothness(strength, reach)) + float(inside @ own)
         q = np.clip(inside, 1e-9, 1 - 1e-9)
         rest = (1 - q) * (data.log_outlier + np.log(OUTLIER) - np.log(1 - q)) + q * (np.log1p(-OUTLIER) - np.log(q))
-        return value + float(rest.sum())
+        return value + float(rest.sum()) - 0.5 * max(float(np.log(factor)) / EXCESS, 0.0) ** 2
 
     best = np.log([smooth.strength, smooth.reach, noise])
     pace = np.array([0.7, 0.7, 0.7])
@@ -223,8 +269,21 @@ def judge(
             factor = float(np.exp(best[2]))
         inside = data.trust * _inside(data, y - mean, alone, factor)
     shade, light = shade_of(data, s)
-    size = size_of(data, gaussian.heights(f, a))
-    return Candidate(s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0)
+    told, height_noise = (perspective.CHANCE, 1.0) if view is None else view.seen.fit(gaussian.heights(f, a))
+    size = max(told - perspective.CHANCE, 0.0)
+    return Candidate(
+        s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0, None, view, height_noise
+    )
+
+
+def judge_again(x: Candidate, data: Data, f: gaussian.Field, s: Float) -> Candidate:
+    """The evidence of the signs `s` (N,), from the settings of `x` on."""
+    return judge(data, f, s, x.smooth, x.noise, 2, x.origin, x.view)
+
+
+def scene(data: Data, f: gaussian.Field, x: Candidate) -> tuple[Data, gaussian.Field]:
+    """The nodes and the field as the candidate has them."""
+    return (data, f) if x.view is None else (x.view.data, x.view.field)
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -253,6 +312,7 @@ def search(
     shape to start from, "cylinder", "sphere" or "plane".
     """
     weight = np.linalg.inv(data.covariance) * data.trust[:, None, None]
+    finalists *= int(np.clip(AFFORDED // len(data.d), 1, MORE))
     patterns, names = starts(data)
     if start != "auto":
         kind = [k for k, name in enumerate(names) if name.startswith(start)]
@@ -261,39 +321,42 @@ def search(
     labels = [patches(data, pairs, level) for level in (0.15, 0.3)]
     lit = np.zeros(len(names), bool)
     none: tuple[Float, list[str]] = patterns[:, :0], []
-    (sized, labels_sized), (shaded, labels_lit) = (size_starts(data), lit_starts(data)) if start == "auto" else (none, none)
+    shaded, labels_lit = lit_starts(data) if start == "auto" else none
     pool: list[tuple[float, Float, gaussian.Smoothness, str]] = []
     for k, (strength, reach) in enumerate(LADDER):
         smooth = gaussian.Smoothness(strength, reach * spacing)
         c = signs.coupling(f, data.d, weight, smooth)
         spectral = signs.spectral_starts(c, 3) if k < 2 and start == "auto" else patterns[:, :0]
-        patterns = np.concatenate((patterns, spectral, sized, shaded), 1)
-        names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_sized + labels_lit
-        lit = np.concatenate((lit, np.zeros(spectral.shape[1] + sized.shape[1], bool), np.ones(shaded.shape[1], bool)))
+        patterns = np.concatenate((patterns, spectral, shaded), 1)
+        names = names + [f"spectral {j + 1}" for j in range(spectral.shape[1])] + labels_lit
+        lit = np.concatenate((lit, np.zeros(spectral.shape[1], bool), np.ones(shaded.shape[1], bool)))
         hot = min(5.0 / max(float(np.median(c.own[c.own > 0])), 1e-9), 1.0)
         patterns = rung(data, c, patterns, lit, labels, hot)
+        for view in data.views if start == "auto" else ():
+            sized = from_sizes(view, smooth, labels, hot)
+            patterns, names = np.concatenate((patterns, sized), 1), names + ["sizes"] * sized.shape[1]
+            lit = np.concatenate((lit, np.arange(sized.shape[1]) > 0))
         if data.shading is not None:  # every pattern may go on with the shading, and without
             patterns, names = np.concatenate((patterns, patterns), 1), names + names
             lit = np.concatenate((lit, ~lit))
         shape = 0.5 * c.log_det - signs.energies(c, patterns, np.zeros_like(patterns))
         found = signs.surface_of(c, patterns)
-        told = [size_of(data, gaussian.heights(f, found[:, j])) for j in range(len(names))]
+        told = [size_of(data, gaussian.heights(f, found[:, j]))[0] for j in range(len(names))]
         value = np.array([shape[j] + shade_of(data, patterns[:, j])[0] + told[j] for j in range(len(names))])
         order = np.argsort(-value, kind="stable")
         order = order[distinct(patterns[:, order], data.trust)][:survivors]
         patterns, names, lit = patterns[:, order], [names[j] for j in order], lit[order]
         pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
-    first = [judge(data, f, s, smooth, 1.0, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
+    first = [judge_as_seen(data, f, s, smooth, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
     moved = [settle(data, f, x) for x in first[:finalists]]
     last = [
-        judge(data, f, moved[k], first[k].smooth, first[k].noise, 2, first[k].origin)
-        for k in distinct(np.stack(moved, 1), data.trust, 0.995)
+        judge_again(first[k], *scene(data, f, first[k]), moved[k]) for k in distinct(np.stack(moved, 1), data.trust, 0.995)
     ]
     best = max(x.evidence for x in last)
     near = [x for x in last if x.evidence > best - AFTERTHOUGHT]
     behind = [replace(x, tuned=False) for x in last if x.evidence <= best - AFTERTHOUGHT]
-    last = sorted(reconsider(data, f, near, pairs), key=lambda x: -x.evidence)
+    last = sorted([*reconsider(data, f, near, pairs), *near], key=lambda x: -x.evidence)
     return last + behind + first[finalists:]
 
 
@@ -317,14 +380,15 @@ def disputed(patterns: Float, trust: Float, pairs: tuple[Int, Int]) -> Int:
 
 def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool) -> Candidate:
     """One pass of `reconsider`; the `last` one states the evidence at the roughness of the surface found."""
+    data, f = scene(data, f, x)
     c = own_coupling(data, f, x)
     learned = roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth)
     x = replace(x, rough=learned.factor)
     if 0 < label.max() < MOST_REGIONS:
         c = own_coupling(data, f, x)
-        x = replace(x, s=signs.flip_regions(c, x.s, bias_of(data, x.s[:, None], np.ones(1, bool), [None])[:, 0], label))
+        x = replace(x, s=signs.flip_regions(c, x.s, bias_of(data, c, x.s[:, None], np.ones(1, bool), [None])[:, 0], label))
     s = settle(data, f, x)
-    x = replace(judge(data, learned.field, s, x.smooth, x.noise, 2, x.origin), rough=learned.factor)
+    x = replace(judge_again(x, data, learned.field, s), rough=learned.factor)
     if not last:
         return x
     c = own_coupling(data, f, x)
@@ -332,14 +396,16 @@ def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool
 
 
 def own_coupling(data: Data, f: gaussian.Field, found: Candidate) -> signs.Coupling:
-    """The coupling at the candidate's own smoothness, roughness and noise, without its outliers."""
+    """The coupling at the candidate's own view, smoothness, roughness and noise, without its outliers."""
+    data, f = scene(data, f, found)
     weight = np.linalg.inv(data.covariance) * (found.inside / found.noise)[:, None, None]
-    return signs.coupling(roughness.shaped(f, found.rough), data.d, weight, found.smooth)
+    height = None if data.heights is None else data.heights.over(found.height_noise)
+    return signs.coupling(roughness.shaped(f, found.rough), data.d, weight, found.smooth, height)
 
 
 def rivals(data: Data, c: signs.Coupling, s: Float) -> tuple[list[Int], Float]:
     """Regions that rival patterns of `s` (N,) turn, and by how many nats (R,) they are worse (`sign_regions.py`)."""
-    bias = bias_of(data, s[:, None], np.ones(1, bool), [None])[:, 0]
+    bias = bias_of(data, c, s[:, None], np.ones(1, bool), [None])[:, 0]
     return sign_regions.rivals(c, data.d, s, bias, neighbours(data.xy))
 
 
@@ -347,7 +413,7 @@ def ties(data: Data, c: signs.Coupling, s: Float, piece: Int) -> tuple[Float, Fl
     """Nats (P, P) by which smoothness ties the pieces (N,) of a pattern `s` (N,) together, and (P,) shading to its light."""
     member = np.zeros((len(s), int(piece.max()) + 1))
     member[np.arange(len(s)), piece] = s
-    bias = bias_of(data, s[:, None], np.ones(1, bool), [None])[:, 0]
+    bias = lit_bias(data, s[:, None], np.ones(1, bool), [None])[:, 0]
     return member.T @ signs.product(c, member), member.T @ bias
 
 
@@ -356,10 +422,11 @@ def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) ->
 
     Energies are those of its own smoothness, noise and outliers.
     """
+    data, f = scene(data, f, found)
     c = own_coupling(data, f, found)
     pairs, s, lit = neighbours(data.xy), found.s, np.ones(1, bool)
     for _ in range(rounds):
-        bias = bias_of(data, s[:, None], lit, [None])[:, 0]
+        bias = bias_of(data, c, s[:, None], lit, [None])[:, 0]
         regions, rise = sign_regions.rivals(c, data.d, s, bias, pairs)
         best = int(rise.argmin())
         if rise[best] > -0.1:

@@ -5,8 +5,9 @@ For known signs the surface is Gaussian; integrating it out leaves an energy of 
 
     E(s) = −½ sᵀ K s − hᵀ s + const,     K = Dᵀ W B A⁻¹ Bᵀ W D,  A = Bᵀ W B + P,
 
-with D = diag(d_i) and `h` whatever else speaks about single signs (shading, element size). No surface can get stuck in it.
-`K` is never formed: a product with it is one banded solution.
+with D = diag(d_i) and `h` whatever else speaks about single signs (shading). No surface can get stuck in it.
+`K` is never formed: a product with it is one banded solution. Measured heights y of precision R (element sizes under
+perspective) with design V enter A as Vᵀ R V, and h as D W B A⁻¹ Vᵀ R y: they tell signs where they lift the surface.
 """
 
 from dataclasses import dataclass
@@ -24,33 +25,51 @@ DAMPING = 0.6  # share of the new mean in a parallel mean-field step; 1 oscillat
 
 @dataclass(frozen=True)
 class Coupling:
-    """K of the collapsed energy: `pull` (N, 2) = W_i d_i, its diagonal `own` (N,), and `log_det` = log det P / det A."""
+    """K of the collapsed energy: `pull` (N, 2) = W_i d_i, its diagonal `own` (N,), `log_det` = log det P / det A; the surface
+    `raised` (M,) that measured heights make by themselves, and the field `lift` (N,) that it is on the signs."""
 
     field: gaussian.Field
     factor: blocks.Factor
     pull: Float
     own: Float
     log_det: float
+    raised: Float
+    lift: Float
 
 
-def coupling(field: gaussian.Field, d: Float, weight: Float, smooth: gaussian.Smoothness) -> Coupling:
-    """The coupling of gradients `d` (N, 2) with precisions `weight` (N, 2, 2)."""
-    factor = gaussian.posterior(field, weight, gaussian.prior(field, smooth))
+def coupling(
+    field: gaussian.Field,
+    d: Float,
+    weight: Float,
+    smooth: gaussian.Smoothness,
+    height: gaussian.Heights | None = None,
+) -> Coupling:
+    """The coupling of gradients `d` (N, 2) with precisions `weight` (N, 2, 2), and of measured heights, if there are any."""
+    factor = gaussian.posterior(field, weight, gaussian.prior(field, smooth), None if height is None else height.precision)
     pull = np.einsum("nij,nj->ni", weight, d)
     variance = gaussian.gradient_covariance(field, factor)
     own = np.einsum("ni,nij,nj->n", pull, variance, pull)
-    return Coupling(field, factor, pull, own, gaussian.prior_logdet(field, smooth) - factor.logdet)
+    log_det = gaussian.prior_logdet(field, smooth) - factor.logdet
+    if height is None:
+        return Coupling(field, factor, pull, own, log_det, np.zeros(field.grid.size), np.zeros(len(d)))
+    raised = blocks.solve(factor, gaussian.lifted(field, height.precision * height.value))
+    lift = (pull * gaussian.gradients(field, raised)).sum(1)
+    return Coupling(field, factor, pull, own, log_det, raised, lift)
 
 
 def surface_of(c: Coupling, m: Float) -> Float:
     """Mean surface coefficients (M, …) for mean signs `m` (N, …)."""
+    return _bent(c, m) + c.raised.reshape(-1, *(1,) * (m.ndim - 1))
+
+
+def _bent(c: Coupling, m: Float) -> Float:
     signed = m[:, None] * c.pull.reshape(c.pull.shape + (1,) * (m.ndim - 1))
     return blocks.solve(c.factor, gaussian.pulled(c.field, signed))
 
 
 def product(c: Coupling, m: Float) -> Float:
     """K m for `m` (N,) or (N, S)."""
-    return np.einsum("ni...,ni->n...", gaussian.gradients(c.field, surface_of(c, m)), c.pull)
+    return np.einsum("ni...,ni->n...", gaussian.gradients(c.field, _bent(c, m)), c.pull)
 
 
 def energies(c: Coupling, s: Float, bias: Float) -> Float:
