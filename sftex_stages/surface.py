@@ -426,9 +426,7 @@ def views(
     params: Params,
 ) -> tuple[sign_search.View, ...]:
     """What the camera that is known would show, or those do that may have been there."""
-    centre, size, bend = frame(image, params)
-    bends = [k / size for k in perspective.TRIALS] if bend is None else [bend]
-    seen = [perspective.view(perspective.Camera(centre, k), nodes.xy, nodes.w, nodes.covariance, sizes) for k in bends]
+    seen = perspective.views(nodes.xy, nodes.w, nodes.covariance, sizes, *frame(image, params))
     return tuple(sign_search.seen_by(data, grid, view) for view in seen)
 
 

@@ -174,10 +174,23 @@ class View:
         told, noise = self.sizes.alike(self.sizes.value + self.change - self.camera.bend * h, self.w)
         return told - self.flat, noise
 
+    def heights(self, xy: Float) -> gaussian.Heights:
+        """What sizes say of heights at the nodes `xy` (M, 2)."""
+        return self.sizes.heights(self.camera, xy, self.w, self.change)
+
 
 def view(camera: Camera, xy: Float, w: Float, covariance: Float, sizes: Sizes) -> View:
     """Nodes at `xy` (M, 2) px, of w (M, 2) in the image and its covariance (M, 2, 2), as `camera` shows them."""
     return View(camera, *flatten_tensors(camera, xy, w, covariance), sizes, sizes.alike(sizes.value, w)[0])
+
+
+def views(
+    xy: Float, w: Float, covariance: Float, sizes: Sizes, centre: tuple[float, float], size: float, bend: float | None
+) -> list[View]:
+    """The same as the camera of 1/f `bend` shows them or, if that is not known, those do that may have been there; `centre` and
+    `size` as in `choose`."""
+    bends = [trial / size for trial in TRIALS] if bend is None else [bend]
+    return [view(Camera(centre, k), xy, w, covariance, sizes) for k in bends]
 
 
 def summit(found: dict[float, float]) -> tuple[float, float]:
@@ -235,32 +248,30 @@ def choose(
         1/f if it is known: only the sign is asked for then.
     """
 
-    def told(bend: float, signs: tuple[float, ...]) -> list[float]:
-        """Log likelihood of the sizes under 1/f for signs of the surface, given what the tensors say there.
+    def told(seen: View, signs: tuple[float, ...]) -> list[float]:
+        """Log likelihood of the sizes as a camera has them for signs of the surface, given what the tensors say there.
 
         Tensors alone like some bends better than others, as the prior has it: that is not theirs to say.
         """
-        camera = Camera(centre, bend)
-        flat, spread, change = flatten_tensors(camera, xy, w, covariance)
-        f = gaussian.make_field(grid, xy, camera.stretch(xy))
-        height = sizes.heights(camera, xy, flat, change)
+        f = gaussian.make_field(grid, xy, seen.camera.stretch(xy))
+        height = seen.heights(xy)
 
         def evidence(sign: float, height: gaussian.Heights | None) -> float:
             smooth, noise = tuned.smooth, tuned.noise
             start = sign * tuned.gradient
-            return refine.refine(f, flat, spread, sizes.trust, start, smooth, ROUNDS, height, noise, scatter).evidence
+            data = f, seen.w, seen.covariance, sizes.trust
+            return refine.refine(*data, start, smooth, ROUNDS, height, noise, scatter).evidence
 
-        alone = evidence(1.0, None) + np.log(bend) * (sizes.trust > 0).sum()  # density of sizes, not of heights
+        alone = evidence(1.0, None) + np.log(seen.camera.bend) * (sizes.trust > 0).sum()  # density of sizes, not of heights
         return [evidence(sign, height) - alone for sign in signs]
 
-    hint = 0.0
+    hint, tried = 0.0, views(xy, w, covariance, sizes, centre, size, bend)
     if bend is None:
         rough = gaussian.make_field(grid, xy)
         firm = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
         factor = gaussian.posterior(rough, firm, gaussian.prior(rough, gaussian.softened(rough, smooth)))
         h = gaussian.heights(rough, blocks.solve(factor, gaussian.pulled(rough, 1e4 * start)))
-        views = [view(Camera(centre, trial / size), xy, w, covariance, sizes) for trial in TRIALS]
-        up, down = (max(0.0, *(v.fit(sign * h)[0] for v in views)) for sign in (1.0, -1.0))
+        up, down = (max(0.0, *(v.fit(sign * h)[0] for v in tried)) for sign in (1.0, -1.0))
         if max(up, down) < CHANCE:
             return Choice(Camera(centre, 0.0), max(up, down), 0.0)
         hint = float(np.sign(up - down)) * max(abs(up - down) - CHANCE, 0.0)
@@ -271,8 +282,8 @@ def choose(
     )
     found: dict[float, float] = {}
     sign, doubt = 0.0, 0.0
-    for trial in TRIALS if bend is None else (bend * size,):
-        up, down = told(trial / size, (1.0, -1.0))
+    for trial, seen in zip(TRIALS if bend is None else (bend * size,), tried, strict=True):
+        up, down = told(seen, (1.0, -1.0))
         found[trial], sign = max(up, down), up - down
         if found[trial] > flat + GAIN or bend is not None:
             break
@@ -285,7 +296,8 @@ def choose(
             best = max(found, key=lambda k: found[k])
             for k in (best * ratio, best / ratio):
                 if BENDS[0] <= k <= BENDS[1] and not any(abs(np.log(k / j)) < 0.01 for j in found):
-                    found[k] = told(k / size, (float(np.sign(sign)),))[0]
+                    seen = view(Camera(centre, k / size), xy, w, covariance, sizes)
+                    found[k] = told(seen, (float(np.sign(sign)),))[0]
             ratio = ratio if max(found, key=lambda k: found[k]) != best else ratio**0.5
         top, doubt = summit(found)
         bend = top / size

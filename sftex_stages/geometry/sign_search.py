@@ -109,8 +109,7 @@ def seen_by(data: Data, grid: spline.Grid, seen: perspective.View) -> View:
     """The nodes of `data` as a camera has them."""
     d, covariance = tensors.gradient(seen.w, seen.covariance)
     d *= np.where((d * data.d).sum(1) < 0, -1.0, 1.0)[:, None]
-    heights = seen.sizes.heights(seen.camera, data.xy, seen.w, seen.change)
-    mine = replace(data, d=d, covariance=covariance, heights=heights, views=())
+    mine = replace(data, d=d, covariance=covariance, heights=seen.heights(data.xy), views=())
     return View(seen, mine, gaussian.make_field(grid, data.xy, seen.camera.stretch(data.xy)))
 
 
@@ -163,6 +162,11 @@ def lit_bias(data: Data, m: Float, lit: NDArray[np.bool_], lights: list[shading.
             lights[k] = light = shading.fit(data.shading, m[:, k], lights[k], 1 if lights[k] else 4)
             bias[:, k] = data.trust * shading.pull(data.shading, light)
     return bias
+
+
+def own_bias(data: Data, c: signs.Coupling, s: Float) -> Float:
+    """Fields (N,) of heights and shading on the pattern `s` (N,), under its own light."""
+    return bias_of(data, c, s[:, None], np.ones(1, bool), [None])[:, 0]
 
 
 def rung(
@@ -386,7 +390,7 @@ def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool
     x = replace(x, rough=learned.factor)
     if 0 < label.max() < MOST_REGIONS:
         c = own_coupling(data, f, x)
-        x = replace(x, s=signs.flip_regions(c, x.s, bias_of(data, c, x.s[:, None], np.ones(1, bool), [None])[:, 0], label))
+        x = replace(x, s=signs.flip_regions(c, x.s, own_bias(data, c, x.s), label))
     s = settle(data, f, x)
     x = replace(judge_again(x, data, learned.field, s), rough=learned.factor)
     if not last:
@@ -405,8 +409,7 @@ def own_coupling(data: Data, f: gaussian.Field, found: Candidate) -> signs.Coupl
 
 def rivals(data: Data, c: signs.Coupling, s: Float) -> tuple[list[Int], Float]:
     """Regions that rival patterns of `s` (N,) turn, and by how many nats (R,) they are worse (`sign_regions.py`)."""
-    bias = bias_of(data, c, s[:, None], np.ones(1, bool), [None])[:, 0]
-    return sign_regions.rivals(c, data.d, s, bias, neighbours(data.xy))
+    return sign_regions.rivals(c, data.d, s, own_bias(data, c, s), neighbours(data.xy))
 
 
 def ties(data: Data, c: signs.Coupling, s: Float, piece: Int) -> tuple[Float, Float]:
@@ -424,9 +427,9 @@ def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) ->
     """
     data, f = scene(data, f, found)
     c = own_coupling(data, f, found)
-    pairs, s, lit = neighbours(data.xy), found.s, np.ones(1, bool)
+    pairs, s = neighbours(data.xy), found.s
     for _ in range(rounds):
-        bias = bias_of(data, c, s[:, None], lit, [None])[:, 0]
+        bias = own_bias(data, c, s)
         regions, rise = sign_regions.rivals(c, data.d, s, bias, pairs)
         best = int(rise.argmin())
         if rise[best] > -0.1:
