@@ -212,11 +212,13 @@ def size_of(data: Data, h: Float) -> tuple[float, View | None, float]:
     return (nats, data.views[k], sign) if nats > 0 else (0.0, None, 1.0)
 
 
-def judge_as_seen(data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, origin: str) -> Candidate:
+def judge_as_seen(
+    data: Data, f: gaussian.Field, s: Float, smooth: gaussian.Smoothness, rounds: int, origin: str
+) -> Candidate:
     """The evidence of pattern `s` (N,), or of its mirror image, under the camera that sizes speak for."""
-    plain = judge(data, f, s, smooth, 1.0, 0, origin)
+    plain = judge(data, f, s, smooth, 1.0, rounds, origin)
     _, view, sign = size_of(data, gaussian.heights(f, plain.a))
-    return plain if view is None else judge(view.data, view.field, sign * s, smooth, 1.0, 0, origin, view)
+    return plain if view is None else judge(view.data, view.field, sign * s, smooth, 1.0, rounds, origin, view)
 
 
 def judge(
@@ -351,7 +353,7 @@ def search(
         order = order[distinct(patterns[:, order], data.trust)][:survivors]
         patterns, names, lit = patterns[:, order], [names[j] for j in order], lit[order]
         pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
-    first = [judge_as_seen(data, f, s, smooth, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
+    first = [judge_as_seen(data, f, s, smooth, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
     moved = [settle(data, f, x) for x in first[:finalists]]
     last = [
@@ -454,7 +456,7 @@ def by_em(data: Data, f: gaussian.Field, spacing: float, finalists: int, start: 
         g = shape(data.xy, k * np.pi / 4)
         result = surface_em.run(data.xy, data.d, data.covariance, data.log_outlier, g, EM_SPACING * spacing)
         s = np.where(result.state[:, 0] < result.state[:, 1], -1.0, 1.0)
-        found.append(judge(data, f, s, smooth, 1.0, 1, f"em, {kind} {45 * k}°"))
+        found.append(judge_as_seen(data, f, s, smooth, 1, f"em, {kind} {45 * k}°"))
     return sorted(found, key=lambda x: -x.evidence)[:finalists]
 
 

@@ -228,3 +228,20 @@ def test_measured_heights_are_in_the_energy_as_in_the_marginal_likelihood():
     mean = gaussian.solve(f, factor, c.pull * s[:, 0, None], height)[0]
     assert np.allclose(signs.surface_of(c, s[:, 0]), mean, atol=1e-8)
     assert np.allclose(signs.surface_of(c, s)[:, 0], mean, atol=1e-8)
+
+
+def test_sizes_rank_what_em_finds():
+    data, grid, _, truth, steep = folds(300, 5, 1e-3)
+    f = gaussian.make_field(grid, data.xy)
+    best, *others = sign_search.by_em(data, f, 23.0, 4)
+    assert best.view is data.views[0] and best.size > 50 and (best.s == truth)[steep].mean() > 0.6
+    assert all(x.evidence < best.evidence for x in others)
+    blind = sign_search.by_em(replace(data, views=()), f, 23.0, 4)
+    assert all(x.view is None and x.size == 0 for x in blind)
+
+
+def test_a_mirrored_pattern_is_judged_with_the_sign_of_the_sizes():
+    data, grid, _, truth, steep = folds(80, 6, 1e-3)
+    f = gaussian.make_field(grid, data.xy)
+    found = sign_search.judge_as_seen(data, f, -truth, gaussian.Smoothness(1.0, 90.0), 1, "mirrored")
+    assert found.view is data.views[0] and found.size > 50 and (found.s == truth)[steep].all()
