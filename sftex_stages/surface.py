@@ -33,6 +33,7 @@ from sftex_stages.geometry import (
     verdict,
 )
 from sftex_stages.geometry import field as irradiance_field
+from sftex_stages.geometry.camera import Camera
 
 Float = NDArray[np.floating]
 
@@ -146,7 +147,7 @@ def collect(frontal: list[Arrays], min_inlier: float, found: Arrays | None = Non
     return rows
 
 
-def prepare(rows: Arrays, params: Params, camera: perspective.Camera | None = None) -> Instances:
+def prepare(rows: Arrays, params: Params, camera: Camera | None = None) -> Instances:
     """Calibrate the textons against one another (`calibration.py`), as the rays of `camera` see them."""
     xy = rows["xy"].astype(float)
     trust = np.where(rows["inlier"] > params.min_inlier, rows["inlier"], 0.0).astype(float)
@@ -245,7 +246,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
 
 
 def look_again(
-    inputs: Mapping[str, Any], rows: Arrays, grid: spline.Grid, a: Float, camera: perspective.Camera, params: Params
+    inputs: Mapping[str, Any], rows: Arrays, grid: spline.Grid, a: Float, camera: Camera, params: Params
 ) -> Arrays:
     """The instances `rows` registered again as the surface of coefficients `a` (M,) shows them (`direct.py`)."""
     xy = rows["xy"].astype(float)
@@ -276,7 +277,7 @@ def refine_again(
     rows: Arrays,
     field: gaussian.Field,
     solution: refine.Solution,
-    camera: perspective.Camera,
+    camera: Camera,
     spacing: float,
     params: Params,
 ) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
@@ -291,7 +292,7 @@ def refit(
     grid: spline.Grid,
     field: gaussian.Field,
     solution: refine.Solution,
-    camera: perspective.Camera,
+    camera: Camera,
     spacing: float,
     params: Params,
 ) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution, gaussian.Heights | None]:
@@ -330,7 +331,7 @@ def doubted(
 
 
 def heights(
-    instances: Instances, nodes: pooling.Nodes, camera: perspective.Camera, spacing: float
+    instances: Instances, nodes: pooling.Nodes, camera: Camera, spacing: float
 ) -> gaussian.Heights | None:
     """What element sizes say of heights at the nodes; None under orthography, or with too few of them."""
     sizes = element_sizes(instances, nodes, spacing) if camera.bend else None
@@ -342,7 +343,7 @@ def recalibrate(
     nodes: pooling.Nodes,
     field: gaussian.Field,
     solution: refine.Solution,
-    camera: perspective.Camera,
+    camera: Camera,
     spacing: float,
     params: Params,
     height: gaussian.Heights | None,
@@ -374,7 +375,7 @@ def pool(instances: Instances, params: Params) -> pooling.Nodes:
 
 
 def quartered(
-    instances: Instances, nodes: pooling.Nodes, grid: spline.Grid, a: Float, camera: perspective.Camera
+    instances: Instances, nodes: pooling.Nodes, grid: spline.Grid, a: Float, camera: Camera
 ) -> Instances:
     """The instances with the cells of those `nodes` quartered in which the surface of coefficients `a` (M,) turns by more than
     `TURN` of what the node knows."""
@@ -403,7 +404,7 @@ def choose_camera(
     `start` (M, 2)."""
     centre, size, bend = frame(image, params)
     if params.camera == "orthographic" or sizes is None:
-        return perspective.Choice(perspective.Camera(centre, bend or 0.0), 0.0, 0.0)
+        return perspective.Choice(Camera(centre, bend or 0.0), 0.0, 0.0)
     w, covariance = nodes.w, nodes.covariance
     return perspective.choose(grid, nodes.xy, w, covariance, sizes, start, best.smooth, best.noise, centre, size, bend)
 
@@ -503,7 +504,7 @@ def outputs(
     solution: refine.Solution,
     field: gaussian.Field,
     spacing: float,
-    camera: perspective.Camera,
+    camera: Camera,
     other: confidence.Other | None,
 ) -> Arrays:
     """Dense maps and instances."""

@@ -5,7 +5,8 @@ from synthetic_instances import instances_of, jittered
 
 from sftex_stages import config, frontal, surface
 from sftex_stages.errors import ConfigError, StageError
-from sftex_stages.geometry import perspective, tensors
+from sftex_stages.geometry import tensors
+from sftex_stages.geometry.camera import Camera
 
 SHAPE = (300, 360)
 QUICK = {"finalists": 1, "camera": "orthographic", "nodes": 250}
@@ -168,7 +169,7 @@ def test_very_few_instances_still_give_a_surface(count):
 @pytest.fixture(scope="module")
 def sheet():
     """Frontal results of a sheet under perspective, focal length 500 px, with the sign of its slopes relative to the rays."""
-    camera = perspective.Camera(((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), 1 / 500)
+    camera = Camera(((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), 1 / 500)
     xy = jittered(SHAPE, 14)
     h = 40 * np.sin(xy[:, 0] / 50) + 35 * np.cos(xy[:, 1] / 45) + 0.3 * xy[:, 1]
     slope = np.stack((0.8 * np.cos(xy[:, 0] / 50), 0.3 - 7 / 9 * np.sin(xy[:, 1] / 45)), 1)

@@ -20,7 +20,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, perspective, pooling, refine, spline, tensors
+from sftex_stages.geometry import blocks, gaussian, pooling, refine, spline, tensors
+from sftex_stages.geometry.camera import ORTHOGRAPHIC, Camera
 
 Float = NDArray[np.floating]
 Int = NDArray[np.integer]
@@ -39,7 +40,7 @@ CHUNK = 4096  # places at a time: bounded memory
 class Other:
     """The surface, coefficients `a` (M,), under another `camera` that may as well be the right one."""
 
-    camera: perspective.Camera
+    camera: Camera
     a: Float
 
 
@@ -56,7 +57,7 @@ class Errors:
     influence: Float
     grid: spline.Grid
     inverse: tuple[Float, Float]
-    camera: perspective.Camera = perspective.ORTHOGRAPHIC
+    camera: Camera = ORTHOGRAPHIC
     other: Other | None = None
 
     @cached_property

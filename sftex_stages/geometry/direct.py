@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sftex_stages.geometry import perspective, registration, tensors, texton
+from sftex_stages.geometry import registration, tensors, texton
+from sftex_stages.geometry.camera import Camera
 
 Float = NDArray[np.floating]
 
@@ -34,7 +35,7 @@ class Seen(NamedTuple):
     transform: Float
 
 
-def foreshortening(g: Float, camera: perspective.Camera, xy: Float) -> Float:
+def foreshortening(g: Float, camera: Camera, xy: Float) -> Float:
     """P (M, 2, 2) of slopes `g` (M, 2) relative to the rays of `xy` (M, 2) px: image transforms but for scale and rotation."""
     n = tensors.normals(g)
     u = -g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from synthetic import glyph, render
 
-from sftex_stages.geometry import direct, imaging, perspective, pyramid, registration
+from sftex_stages.geometry import direct, imaging, pyramid, registration
+from sftex_stages.geometry.camera import ORTHOGRAPHIC, Camera
 
 HALF, RADIUS = 14, 17.0
 SKEW = np.array([[1.04, 0.03], [0.0, 0.95]])  # of the frame that the appearance is drawn in
@@ -29,15 +30,15 @@ def slopes(scene):
 
 
 def foreshortening(scene):
-    return direct.foreshortening(slopes(scene), perspective.ORTHOGRAPHIC, scene.xy)
+    return direct.foreshortening(slopes(scene), ORTHOGRAPHIC, scene.xy)
 
 
 def test_foreshortening_is_that_of_the_surface_as_the_ray_sees_it(scene):
-    camera = perspective.Camera((180.0, 180.0), 1 / 400)
+    camera = Camera((180.0, 180.0), 1 / 400)
     p = direct.foreshortening(slopes(scene), camera, scene.xy)
     seen = camera.flatten(scene.xy) @ p
     assert np.allclose(imaging.tensor_of(seen), imaging.tensor_of_normal(scene.normal), atol=1e-12)
-    level = direct.foreshortening(np.zeros((1, 2)), perspective.ORTHOGRAPHIC, np.zeros((1, 2)))
+    level = direct.foreshortening(np.zeros((1, 2)), ORTHOGRAPHIC, np.zeros((1, 2)))
     assert np.allclose(level, np.eye(2))
 
 

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from sftex_stages.geometry import blocks, gaussian, perspective, spline, tensors
+from sftex_stages.geometry.camera import Camera
 from sftex_stages.measures import relative_to_ray
 
 F, CENTRE, SIZE = 700.0, (200.0, 150.0), 400.0
-CAMERA = perspective.Camera(CENTRE, 1 / F)
+CAMERA = Camera(CENTRE, 1 / F)
 
 
 def range_of(xy):
@@ -67,7 +68,7 @@ def test_slopes_tensors_and_sizes_are_those_of_a_pinhole_camera(view):
 
 def test_flattened_tensors_are_those_of_flattened_transforms(view):
     xy, _, transform = view
-    image, log_scale = seen(perspective.Camera(CENTRE, 0.0), xy, transform)
+    image, log_scale = seen(Camera(CENTRE, 0.0), xy, transform)
     w, covariance, change = perspective.flatten_tensors(CAMERA, xy, image, np.tile(np.eye(2), (len(xy), 1, 1)))
     expected, flat_scale = seen(CAMERA, xy, transform)
     assert np.allclose(w, expected, atol=1e-9)
@@ -77,7 +78,7 @@ def test_flattened_tensors_are_those_of_flattened_transforms(view):
 
 def test_orthography_changes_nothing():
     xy = np.random.default_rng(0).uniform(0, 300, (20, 2))
-    camera = perspective.Camera(CENTRE, 0.0)
+    camera = Camera(CENTRE, 0.0)
     assert np.allclose(camera.flatten(xy), np.eye(2)) and np.allclose(camera.stretch(xy), np.eye(2))
     assert np.array_equal(camera.height(xy, xy[:, 0]), xy[:, 0])
 
@@ -88,7 +89,7 @@ def problem(view, noise, true):
     rng = np.random.default_rng(2)
     slope = derivative(h_of, xy)
     if true.bend:
-        w, log_scale = seen(perspective.Camera(CENTRE, 0.0), xy, transform)
+        w, log_scale = seen(Camera(CENTRE, 0.0), xy, transform)
     else:
         w, log_scale = tensors.predict(slope)[0], 0.1 * np.hypot(*tensors.predict(slope)[0].T)  # size follows slant
     w = w + noise * rng.normal(size=w.shape)
@@ -111,7 +112,7 @@ def test_focal_length_and_sign_come_from_the_sizes(view, mirror):
 
 
 def test_sizes_that_follow_the_slant_prove_no_perspective(view):
-    grid, xy, w, covariance, sizes, slope = problem(view, 0.01, perspective.Camera(CENTRE, 0.0))
+    grid, xy, w, covariance, sizes, slope = problem(view, 0.01, Camera(CENTRE, 0.0))
     smooth = gaussian.Smoothness(1.0, 40.0)
     choice = perspective.choose(grid, xy, w, covariance, sizes, slope, smooth, 1.0, CENTRE, SIZE)
     assert choice.camera.bend == 0 and choice.gain < perspective.GAIN
@@ -119,7 +120,7 @@ def test_sizes_that_follow_the_slant_prove_no_perspective(view):
 
 
 def views_of(xy, w, covariance, sizes):
-    cameras = [perspective.Camera(CENTRE, k / SIZE) for k in perspective.TRIALS]
+    cameras = [Camera(CENTRE, k / SIZE) for k in perspective.TRIALS]
     return [perspective.view(camera, xy, w, covariance, sizes) for camera in (CAMERA, *cameras)]
 
 
@@ -133,7 +134,7 @@ def test_sizes_are_those_of_the_surface_under_its_own_camera_and_sign(view):
 
 
 def test_sizes_under_orthography_are_those_of_no_camera(view):
-    _, xy, w, covariance, sizes, _ = problem(view, 0.01, perspective.Camera(CENTRE, 0.0))
+    _, xy, w, covariance, sizes, _ = problem(view, 0.01, Camera(CENTRE, 0.0))
     told = [v.fit(sign * h_of(xy))[0] for v in views_of(xy, w, covariance, sizes) for sign in (1, -1)]
     assert max(told) < perspective.CHANCE
 
@@ -175,7 +176,7 @@ def test_a_dome_too_has_a_focal_length():
     """Sizes of a dome follow its slant as well: what the slant explains must not take the depth's part. The noise is a tenth
     of what is stated, as on clean images; evidences that have not settled compare wrongly there."""
     f, size, centre = 1400.0, 1100.0, (550.0, 370.0)
-    camera, shape = perspective.Camera(centre, 1 / f), 1.1e-3
+    camera, shape = Camera(centre, 1 / f), 1.1e-3
     grid_xy = np.stack(np.meshgrid(np.arange(60, 1050, 45.0), np.arange(40, 710, 45.0)), -1).reshape(-1, 2)
 
     def h(xy):

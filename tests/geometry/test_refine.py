@@ -3,7 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sftex_stages.geometry import blocks, confidence, gaussian, perspective, pooling, refine, spline, support, tensors
+from sftex_stages.geometry import blocks, confidence, gaussian, pooling, refine, spline, support, tensors
+from sftex_stages.geometry.camera import ORTHOGRAPHIC
 
 
 def exact(seed=0):
@@ -139,7 +140,7 @@ def refined(rng, count=3000, textons=8, shear=0.0, noise=0.02):
     f = gaussian.make_field(spline.cover(np.full(2, -40.0), np.full(2, 440.0), 25.0), nodes.xy)
     start = np.tile([0.8, 0.3], (len(nodes.xy), 1))
     s = refine.refine(f, nodes.w, nodes.covariance, nodes.weight, start, gaussian.Smoothness(1.0, 60.0), 2)
-    g = np.einsum("npk,nk->np", perspective.ORTHOGRAPHIC.stencil(f.grid, xy)[1], s.a[spline.stencil(f.grid, xy)[0]])
+    g = np.einsum("npk,nk->np", ORTHOGRAPHIC.stencil(f.grid, xy)[1], s.a[spline.stencil(f.grid, xy)[0]])
     return f, s, nodes, w, stated, xy, g, texton
 
 
@@ -157,7 +158,7 @@ def test_what_a_texton_has_wrong_widens_the_spread_as_much_as_it_errs():
         f, s, nodes, w, stated, _, g, texton = refined(np.random.default_rng(seed), 1000, shear=0.03, noise=0.002)
         residual, _ = confidence.residuals(w, stated, g)
         moved = confidence.influence(f, s, nodes, residual, texton)
-        index, stencil = perspective.ORTHOGRAPHIC.stencil(f.grid, at)
+        index, stencil = ORTHOGRAPHIC.stencil(f.grid, at)
         slope = np.einsum("npk,nk->np", stencil, s.a[index])
         actual.append(((slope - [0.8, 0.3]) ** 2).sum(1).mean())
         predicted.append((np.einsum("npk,nkt->npt", stencil, moved[index]) ** 2).sum((1, 2)).mean())

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sftex_stages.geometry import gaussian, perspective, shading, sign_search, signs, spline, surface_em, tensors
+from sftex_stages.geometry.camera import Camera
 
 
 def problem(n, seed, noise=0.05, extent=100.0, bend=60.0):
@@ -172,7 +173,7 @@ def test_roughness_of_its_own_is_in_a_candidates_coupling():
 def folds(count, seed, noise):
     """Folds as a pinhole camera shows them: nodes and the sizes of their elements, a grid, heights, signs, which are steep."""
     rng = np.random.default_rng(seed)
-    camera = perspective.Camera((200.0, 200.0), 1 / 1200)
+    camera = Camera((200.0, 200.0), 1 / 1200)
     xy = rng.uniform(0, 400, (count, 2))
     h = 15 * np.sin(xy[:, 0] / 25) + 10 * np.cos(xy[:, 1] / 40)
     g = np.stack((15 / 25 * np.cos(xy[:, 0] / 25), -10 / 40 * np.sin(xy[:, 1] / 40)), 1)
