@@ -16,6 +16,7 @@ from sftex_stages.geometry import (
     blocks,
     calibration,
     confidence,
+    curvature,
     direct,
     gaussian,
     imaging,
@@ -95,7 +96,7 @@ class Params(StageParams):
 
 
 TURN = 0.5  # of what a node knows: a cell in which the surface turns by more is quartered
-ROUNDS = 3  # of a refinement that chooses smoothness and noise
+ROUNDS, CURVED_ROUNDS = 3, 4  # of a refinement that chooses smoothness and noise; of one whose prior follows the surface
 STEEP = 3.5  # slope (74 degrees) beyond which instances are not registered again any steeper: nothing is left of them
 
 
@@ -111,6 +112,19 @@ class Instances:
     covariance: Float  # of w, (N, 2, 2)
     log_scale: Float  # (N,) of the calibrated transforms, up to a constant a texton
     cell: Float  # (N,) px of the cells that they are pooled in
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A refined surface, and the instances, the nodes and the measured heights it was refined from, as `camera` sees them; nats by
+    which the prior of curvature beat that of heights."""
+
+    instances: Instances
+    nodes: pooling.Nodes
+    solution: refine.Solution
+    height: gaussian.Heights | None
+    camera: Camera
+    gain: float
 
 
 def collect(frontal: list[Arrays], min_inlier: float, found: Arrays | None = None) -> Arrays:
@@ -192,7 +206,9 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     texton/… (K, …) of the textons used: part, their number; shear, (e1, e2) of the correction I + ((e1, e2), (e2, −e1)) of the
     frontal frame; slant_bias, degrees, the median of how much steeper it was delivered than the surface is; noise, factor on
     its variance; reason, in words, if it disagrees with the others, else "".
-    energy, −log evidence of the surface; candidate/… and light: see `record`.
+    energy, −log evidence of the surface; curvature_gain, nats by which the prior that charges for the surface's curvature is
+    likelier than that which charges for the height map's derivatives (negative: this one was taken); candidate/… and light: see
+    `record`.
 
     Raises
     ------
@@ -232,13 +248,12 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     fine = gaussian.make_field(coarse.grid, nodes.xy, camera.stretch(nodes.xy))
     solution = refine.refine(fine, nodes.w, nodes.covariance, nodes.weight, start, best.smooth, ROUNDS, height, best.noise)
     grid = spline.cover(low, high, params.detail * spacing)
-    instances, nodes, fine, solution, height = refit(instances, grid, fine, solution, camera, spacing, params)
-    instances, nodes, fine, solution = recalibrate(instances, nodes, fine, solution, camera, spacing, params, height)
+    fitted = refit(instances, grid, solution, camera, spacing, params)
     for _ in range(params.direct):
-        rows = look_again(inputs, rows, fine.grid, solution.a, camera, params)
-        instances, nodes, fine, solution = refine_again(rows, fine, solution, camera, spacing, params)
-    other = doubted(rows, instances, fine, solution, choice, spacing, params) if choice.doubt else None
-    results = outputs(mask, instances, nodes, solution, fine, spacing, camera, other)
+        rows = look_again(inputs, rows, grid, fitted.solution.a, camera, params)
+        fitted = refit(prepare(rows, params, camera), grid, fitted.solution, camera, spacing, params)
+    other = doubted(rows, fitted, choice, spacing, params) if choice.doubt else None
+    results = outputs(mask, fitted, spacing, other)
     results["instance/sign_margin"] = margin.astype(np.float32)
     results["focal_sigma"] = np.array(choice.doubt / camera.bend if choice.doubt else 0.0)
     results |= verdict.by_piece(results["piece"], before, found, regions, rise)
@@ -273,60 +288,61 @@ def look_again(
     return rows
 
 
-def refine_again(
-    rows: Arrays,
-    field: gaussian.Field,
-    solution: refine.Solution,
-    camera: Camera,
-    spacing: float,
-    params: Params,
-) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
-    """The surface refined from instances `rows` that were registered again."""
-    instances = prepare(rows, params, camera)
-    instances, nodes, field, solution, height = refit(instances, field.grid, field, solution, camera, spacing, params)
-    return recalibrate(instances, nodes, field, solution, camera, spacing, params, height)
-
-
 def refit(
-    instances: Instances,
-    grid: spline.Grid,
-    field: gaussian.Field,
-    solution: refine.Solution,
-    camera: Camera,
-    spacing: float,
-    params: Params,
-) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution, gaussian.Heights | None]:
-    """The surface `solution` on `field` refined on `grid` from `instances` pooled anew, more finely where it turns."""
+    instances: Instances, grid: spline.Grid, before: refine.Solution, camera: Camera, spacing: float, params: Params
+) -> Fit:
+    """The surface `before` refined on `grid` from `instances` pooled anew, more finely where it turns.
+
+    The prior charges for the height map's roughness or for the surface's curvature: whichever has the greater evidence.
+    """
     nodes = pool(instances, params)
-    instances = quartered(instances, nodes, field.grid, solution.a, camera)
+    instances = quartered(instances, nodes, before.field.grid, before.a, camera)
     nodes = pool(instances, params)
     stretch = camera.stretch(nodes.xy)
-    start = gaussian.gradients(gaussian.make_field(field.grid, nodes.xy, stretch), solution.a)
+    start = gaussian.gradients(gaussian.make_field(before.field.grid, nodes.xy, stretch), before.a)
     height = heights(instances, nodes, camera, spacing)
-    field = gaussian.make_field(grid, nodes.xy, stretch)
-    w, covariance, weight = nodes.w, nodes.covariance, nodes.weight
-    solution = refine.refine(field, w, covariance, weight, start, solution.smooth, ROUNDS, height, solution.noise)
-    return instances, nodes, field, solution, height
+    field, data = gaussian.make_field(grid, nodes.xy, stretch), (nodes.w, nodes.covariance, nodes.weight)
+    flat = refine.refine(field, *data, start, before.smooth, ROUNDS, height, before.noise)
+    field, settings = curvature.follow(field, flat.a, camera), (height, flat.noise, flat.height_noise)
+    curved = refine.refine(field, *data, flat.gradient, flat.smooth, CURVED_ROUNDS, *settings, camera=camera)
+    solution = max((flat, curved), key=lambda x: x.evidence)
+    return recalibrated(Fit(instances, nodes, solution, height, camera, curved.evidence - flat.evidence), params)
 
 
-def doubted(
-    rows: Arrays,
-    instances: Instances,
-    field: gaussian.Field,
-    solution: refine.Solution,
-    choice: perspective.Choice,
-    spacing: float,
-    params: Params,
-) -> confidence.Other:
+def recalibrated(fit: Fit, params: Params) -> Fit:
+    """Textons corrected by the surface, and the surface refined from them: one round of the alternation. Then the prior learns
+    where the surface is rough."""
+    instances, nodes, solution, height, camera = fit.instances, fit.nodes, fit.solution, fit.height, fit.camera
+    grid, curved = solution.field.grid, solution.field.cells is not None
+    seen, _ = tensors.predict(camera.slopes_of(grid, solution.a, instances.xy))
+    transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
+    found = calibration.against_surface(
+        instances.calibration, transform, instances.covariance, instances.texton, instances.trust, seen
+    )
+    if not np.array_equal(found.e, instances.calibration.e):
+        instances = replace(instances, calibration=found)
+        nodes = pool(instances, params)
+        field = gaussian.make_field(grid, nodes.xy, camera.stretch(nodes.xy))
+        start = gaussian.gradients(field, solution.a)
+        field = curvature.follow(field, solution.a, camera) if curved else field
+        data, settings = (nodes.w, nodes.covariance, nodes.weight), (height, solution.noise, solution.height_noise)
+        solution = refine.refine(field, *data, start, solution.smooth, 1, *settings)
+    data = nodes.w, nodes.covariance, nodes.weight
+    solution = refine.refine_locally(*data, solution, height, camera if curved else None)
+    return replace(fit, instances=instances, nodes=nodes, solution=solution)
+
+
+def doubted(rows: Arrays, fit: Fit, choice: perspective.Choice, spacing: float, params: Params) -> confidence.Other:
     """The same surface as a camera shows it whose 1/f is off by as much as must be expected."""
-    camera = replace(choice.camera, bend=choice.camera.bend * np.exp(choice.doubt))
-    instances = replace(prepare(rows, params, camera), cell=instances.cell)
+    camera, known = replace(choice.camera, bend=choice.camera.bend * np.exp(choice.doubt)), fit.solution
+    instances = replace(prepare(rows, params, camera), cell=fit.instances.cell)
     nodes = pool(instances, params)
     height = heights(instances, nodes, camera, spacing)
-    field = replace(gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy)), energies=field.energies)
-    start = gaussian.gradients(field, solution.a)
-    w, covariance, weight, smooth, noise = nodes.w, nodes.covariance, nodes.weight, solution.smooth, solution.noise
-    found = refine.refine(field, w, covariance, weight, start, smooth, 2, height, noise, solution.height_noise, tune=False)
+    field = gaussian.make_field(known.field.grid, nodes.xy, camera.stretch(nodes.xy))
+    field = replace(field, energies=known.field.energies)
+    start = gaussian.gradients(field, known.a)
+    data, settings = (nodes.w, nodes.covariance, nodes.weight), (height, known.noise, known.height_noise)
+    found = refine.refine(field, *data, start, known.smooth, 2, *settings, tune=False)
     return confidence.Other(camera, found.a)
 
 
@@ -336,34 +352,6 @@ def heights(
     """What element sizes say of heights at the nodes; None under orthography, or with too few of them."""
     sizes = element_sizes(instances, nodes, spacing) if camera.bend else None
     return sizes.heights(camera, nodes.xy, nodes.w, np.log(camera.rays(nodes.xy)[1])) if sizes else None
-
-
-def recalibrate(
-    instances: Instances,
-    nodes: pooling.Nodes,
-    field: gaussian.Field,
-    solution: refine.Solution,
-    camera: Camera,
-    spacing: float,
-    params: Params,
-    height: gaussian.Heights | None,
-) -> tuple[Instances, pooling.Nodes, gaussian.Field, refine.Solution]:
-    """Textons corrected by the surface, and the surface refined from them: one round of the alternation. Then the prior learns
-    where the surface is rough."""
-    seen, _ = tensors.predict(camera.slopes_of(field.grid, solution.a, instances.xy))
-    transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
-    found = calibration.against_surface(
-        instances.calibration, transform, instances.covariance, instances.texton, instances.trust, seen
-    )
-    if not np.array_equal(found.e, instances.calibration.e):
-        instances = replace(instances, calibration=found)
-        nodes = pool(instances, params)
-        field = gaussian.make_field(field.grid, nodes.xy, camera.stretch(nodes.xy))
-        start, smooth = gaussian.gradients(field, solution.a), solution.smooth
-        solution = refine.refine(
-            field, nodes.w, nodes.covariance, nodes.weight, start, smooth, 1, height, solution.noise, solution.height_noise
-        )
-    return instances, nodes, *refine.refine_locally(field, nodes.w, nodes.covariance, nodes.weight, solution, height)
 
 
 def pool(instances: Instances, params: Params) -> pooling.Nodes:
@@ -499,23 +487,20 @@ def search_data(instances: Instances, nodes: pooling.Nodes, spacing: float, para
 
 def outputs(
     mask: NDArray[np.bool_],
-    instances: Instances,
-    nodes: pooling.Nodes,
-    solution: refine.Solution,
-    field: gaussian.Field,
+    fit: Fit,
     spacing: float,
-    camera: Camera,
     other: confidence.Other | None,
 ) -> Arrays:
     """Dense maps and instances."""
-    table = instances.table
-    g = camera.slopes_of(field.grid, solution.a, instances.xy)
+    instances, solution, camera = fit.instances, fit.solution, fit.camera
+    table, grid = instances.table, solution.field.grid
+    g = camera.slopes_of(grid, solution.a, instances.xy)
     k, found = instances.trust > 0, instances.calibration
     residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
-    moved = confidence.influence(field, solution, nodes, residual, instances.texton)
+    moved = confidence.influence(solution, fit.nodes, residual, instances.texton)
     inverse = blocks.selected_inverse(solution.factor)
     errors = confidence.Errors(
-        instances.xy[k], residual[k], chi2[k], found.common, moved, field.grid, inverse, camera, other
+        instances.xy[k], residual[k], chi2[k], found.common, moved, grid, inverse, camera, other
     )
     spread = confidence.spread(errors, instances.xy, g)
     sigma = confidence.angle(errors, instances.xy, g, spread)
@@ -527,7 +512,7 @@ def outputs(
     seen = (instances.trust > 0) & (state[:, 2] < 0.8)
     # what a search finds fills holes; how far a measurement speaks is told by those that were there before
     reach = support.reach(instances.xy[seen & ~table["searched"]], spacing)
-    maps = support.dense(field, solution.a, mask.shape, instances.xy[seen], spacing, errors, reach)
+    maps = support.dense(grid, solution.a, mask.shape, instances.xy[seen], spacing, errors, reach)
     piece = support.pieces(support.close_holes(maps["supported"] & mask, maps["closable"] & mask), spacing**2)
     valid = piece > 0
     nan = np.float32(np.nan)
@@ -553,6 +538,7 @@ def outputs(
         "focal_px": np.array(1 / camera.bend if camera.bend else np.inf),
         "principal_point": np.array(camera.centre),
         "energy": np.array(-solution.evidence),
+        "curvature_gain": np.array(fit.gain),
     }
 
 
@@ -613,4 +599,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=16, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=17, params=Params, run=run, inputs=("image", "frontal", "enrich"))

@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sftex_stages.geometry import blocks, gaussian, pooling, refine, spline, tensors
+from sftex_stages.geometry import blocks, pooling, refine, spline, tensors
 from sftex_stages.geometry.camera import ORTHOGRAPHIC, Camera
 
 Float = NDArray[np.floating]
@@ -85,13 +85,13 @@ def residuals(w: Float, covariance: Float, g: Float) -> tuple[Float, Float]:
     return residual, np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual) / 2
 
 
-def influence(f: gaussian.Field, solution: refine.Solution, nodes: pooling.Nodes, residual: Float, texton: Int) -> Float:
+def influence(solution: refine.Solution, nodes: pooling.Nodes, residual: Float, texton: Int) -> Float:
     """By how much each texton's residuals move the surface: coefficients (M, K), whose squares add up to a covariance.
 
     Parameters
     ----------
-    f, solution
-        the field at the nodes, and the surface refined on them.
+    solution
+        the surface refined on the nodes.
     residual, texton : (N, 2), (N,)
         of w against the surface, and number, of the instances that the nodes were pooled from.
     """
@@ -101,7 +101,7 @@ def influence(f: gaussian.Field, solution: refine.Solution, nodes: pooling.Nodes
     if group.max() == 0:  # a single texton: its nodes have to do
         group = node
     count = int(group.max()) + 1
-    jacobian = tensors.predict(solution.gradient)[1]
+    f, jacobian = solution.field, tensors.predict(solution.gradient)[1]
     precision = np.linalg.inv(nodes.covariance) * (solution.weight / solution.noise)[:, None, None]
     gain = np.swapaxes(jacobian, 1, 2) @ precision
     pull = np.einsum("nij,njk,nk->ni", gain[node], nodes.share[used], residual[used])

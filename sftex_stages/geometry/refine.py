@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sftex_stages.geometry import blocks, gaussian, roughness, tensors
+from sftex_stages.geometry import blocks, curvature, gaussian, roughness, tensors
+from sftex_stages.geometry.camera import Camera
 
 Float = NDArray[np.floating]
 
@@ -23,8 +24,10 @@ LOCAL_ROUNDS = (1, 1, 2)  # of each pass that learns where the surface is rough;
 
 @dataclass(frozen=True)
 class Solution:
-    """Coefficients `a` (M,), the posterior's factor, and at the points: gradient, its covariance, robust weights (N,) ≤ 1.5."""
+    """The field with the prior it was found under, coefficients `a` (M,), the posterior's factor, and at the points: gradient,
+    its covariance, robust weights (N,) ≤ 1.5."""
 
+    field: gaussian.Field
     a: Float
     factor: blocks.Factor
     gradient: Float
@@ -81,6 +84,7 @@ def refine(
     noise: float = 1.0,
     height_noise: float = 2.0,
     tune: bool = True,
+    camera: Camera | None = None,
 ) -> Solution:
     """The surface from tensors `w` (N, 2) with `covariance` (N, 2, 2), trusted by `trust` (N,) in 0…1.
 
@@ -95,6 +99,8 @@ def refine(
         heights, their precisions up to one noise factor, if they are measured (element size under perspective).
     noise, height_noise
         factors on `covariance`, and on the heights' variance, to start from; `tune=False` keeps them and the smoothness.
+    camera
+        if given, every round but the first has the prior of curvature about the surface of the last (`curvature.py`).
     """
     precision = np.linalg.inv(covariance)
     g, robust = limit(start), trust.copy()
@@ -116,7 +122,7 @@ def refine(
         information, pull, constant = linearise(w, precision * (robust / noise)[:, None, None], g)
         return constant + gaussian.log_evidence(f, information, pull, gaussian.Smoothness(strength, reach), rise(x))
 
-    for _ in range(rounds):
+    for k in range(rounds):
         if tune:
             x, moved = climb(score, x, pace)
             pace = pace if moved else pace / 2
@@ -129,28 +135,33 @@ def refine(
         spread = gaussian.gradient_covariance(f, factor)
         mean, alone = gaussian.without_own(g, spread, information, pull)
         robust = trust * student(w, precision / noise, limit(mean), alone)[0]
-    return Solution(a, factor, g, spread, robust, smooth, noise, score(x), float(np.exp(x[3])) if len(x) > 3 else 1.0)
+        if camera is not None and k < rounds - 1:
+            f = curvature.follow(f, a, camera)
+            x[0] = np.log(gaussian.softened(f, smooth).strength)
+    return Solution(f, a, factor, g, spread, robust, smooth, noise, score(x), float(np.exp(x[3])) if len(x) > 3 else 1.0)
 
 
 def refine_locally(
-    f: gaussian.Field,
     w: Float,
     covariance: Float,
     trust: Float,
     found: Solution,
     height: gaussian.Heights | None = None,
-) -> tuple[gaussian.Field, Solution]:
-    """The surface `found` refined under a prior that is rougher where it is rough (`roughness.py`), and the field with that
-    prior. Overall smoothness and noise stay as found.
+    camera: Camera | None = None,
+) -> Solution:
+    """The surface `found` refined under a prior that is rougher where it is rough (`roughness.py`), and with a `camera` about
+    its own curvature. Overall smoothness and noise stay as found.
 
     At first nothing is let go: what looks like outliers to a smooth prior may be a fold to a rough one.
     """
-    shaped = f
+    f = found.field
     for rounds in LOCAL_ROUNDS:
+        if camera is not None:
+            f = curvature.follow(f, found.a, camera)
         shaped = roughness.learn(f, found.a, found.factor, found.smooth).field
         start, smooth, noise = found.gradient, found.smooth, found.noise
         found = refine(shaped, w, covariance, trust, start, smooth, rounds, height, noise, found.height_noise, tune=False)
-    return shaped, found
+    return found
 
 
 def climb(score: Callable[[Float], float], x: Float, pace: Float) -> tuple[Float, bool]:

@@ -39,22 +39,9 @@ class Roughness(NamedTuple):
     field: gaussian.Field
 
 
-def cells(grid: spline.Grid) -> Int:
-    """Coefficient numbers (C, 16) of all cells of a grid."""
-    outer, inner = _places(grid)
-    k = np.arange(4)
-    index = (outer[:, None] + k)[:, :, None] * grid.shape[1] + (inner[:, None] + k)[:, None, :]
-    return index.reshape(-1, 16)
-
-
-def _places(grid: spline.Grid) -> tuple[Int, Int]:
-    outer, inner = np.indices((grid.cells[grid.outer], grid.cells[1 - grid.outer]))
-    return outer.ravel(), inner.ravel()
-
-
 def squares(grid: spline.Grid, side: int) -> Int:
     """The block (C,), from 0, of `side` by `side` cells that each cell of a grid is in."""
-    outer, inner = _places(grid)
+    outer, inner = spline.places(grid)
     across = -(-grid.cells[1 - grid.outer] // side)
     return outer // side * across + inner // side
 
@@ -64,24 +51,35 @@ def cell_energy(grid: spline.Grid, order: int) -> Float:
     return np.asarray(spline.energy(replace(grid, cells=(1, 1)), order).todense())
 
 
+def energies(f: gaussian.Field) -> tuple[Float, Float]:
+    """E2 and E3 of every cell, (C, 16, 16) each."""
+    if f.cells is not None:
+        return f.cells
+    count = int(np.prod(f.grid.cells))
+    second, third = (np.broadcast_to(cell_energy(f.grid, m), (count, 16, 16)) for m in (2, 3))
+    return second, third
+
+
 def shaped(f: gaussian.Field, factor: Float | None) -> gaussian.Field:
-    """The field with the energies of its prior multiplied by `factor` (C,) cell by cell; None: as it is."""
+    """The field with the energies of its cells multiplied by `factor` (C,); None: as it is."""
     if factor is None:
         return f
-    add = gaussian.scatter(f.grid, cells(f.grid))
-    local = [add(factor[:, None, None] * cell_energy(f.grid, m)) for m in (2, 3)]
+    add = gaussian.scatter(f.grid, spline.cells(f.grid))
+    local = [add(factor[:, None, None] * e) for e in energies(f)]
     return replace(f, energies=(*f.energies[:2], *local), logdets={})
 
 
 def learn(f: gaussian.Field, a: Float, factor: blocks.Factor, smooth: gaussian.Smoothness) -> Roughness:
     """Factors of the cells for the posterior of mean `a` (M,) and precision `factor`, under the prior `smooth` over all."""
-    index = cells(f.grid)
-    energy = smooth.strength * (cell_energy(f.grid, 2) + smooth.reach**2 * cell_energy(f.grid, 3))
+    index, (second, third) = spline.cells(f.grid), energies(f)
     inverse, unit = blocks.selected_inverse(factor), np.eye(16)[None]
-    found = np.einsum("ci,ij,cj->c", a[index], energy, a[index])
+    found = np.empty(len(index))
     for at in (slice(k, k + blocks.CHUNK) for k in range(0, len(index), blocks.CHUNK)):
         every = np.broadcast_to(unit, (len(index[at]), 16, 16))
-        found[at] += np.einsum("cij,ij->c", blocks.covariance(inverse, index[at], every, every), energy)
+        moment = blocks.covariance(inverse, index[at], every, every)
+        moment += a[index[at]][:, :, None] * a[index[at]][:, None, :]
+        energy = smooth.strength * (second[at] + smooth.reach**2 * third[at])
+        found[at] = np.einsum("cij,cij->c", moment, energy)
     levels = [squares(f.grid, side) for side in BLOCKS]
     number = [np.bincount(level).astype(float) for level in levels]
     mean = np.ones((len(levels), len(index)))

@@ -91,6 +91,26 @@ def stencil(grid: Grid, xy: Float, dx: int = 0, dy: int = 0) -> tuple[NDArray[np
     return index.reshape(len(xy), 16), value.reshape(len(xy), 16)
 
 
+def places(grid: Grid) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """Number along the outer and along the inner axis (C,) of all cells of a grid."""
+    outer, inner = np.indices((grid.cells[grid.outer], grid.cells[1 - grid.outer]))
+    return outer.ravel(), inner.ravel()
+
+
+def cells(grid: Grid) -> NDArray[np.integer]:
+    """Coefficient numbers (C, 16) of all cells, in the order of `places`."""
+    outer, inner = places(grid)
+    k = np.arange(4)
+    index = (outer[:, None] + k)[:, :, None] * grid.shape[1] + (inner[:, None] + k)[:, None, :]
+    return index.reshape(-1, 16)
+
+
+def centres(grid: Grid) -> Float:
+    """Middles (C, 2) px of all cells, in the order of `places`."""
+    at = np.stack(places(grid), 1)
+    return np.array(grid.origin) + (at[:, [grid.outer, 1 - grid.outer]] + 0.5) * grid.spacing
+
+
 def design(grid: Grid, xy: Float, dx: int = 0, dy: int = 0) -> sp.csr_matrix:
     """Sparse (N, M) matrix that takes coefficients to the (dx, dy) derivative of the field at `xy` (N, 2) px."""
     index, value = stencil(grid, xy, dx, dy)

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-from sftex_stages.geometry import confidence, gaussian, spline, tensors
+from sftex_stages.geometry import confidence, spline, tensors
 
 Float = NDArray[np.floating]
 
@@ -52,7 +52,7 @@ def surrounded(xy: Float, at: Float, count: int = 24) -> NDArray[np.bool_]:
 
 
 def dense(
-    f: gaussian.Field,
+    grid: spline.Grid,
     a: Float,
     shape: tuple[int, int],
     xy: Float,
@@ -68,25 +68,25 @@ def dense(
     evaluated on a coarse raster and interpolated.
     """
     rows, columns = np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float)
-    g = np.stack([spline.evaluate(f.grid, a, columns, rows, *d) for d in ((1, 0), (0, 1))], -1)
+    g = np.stack([spline.evaluate(grid, a, columns, rows, *d) for d in ((1, 0), (0, 1))], -1)
     pixels = np.stack(np.meshgrid(columns, rows), -1)
     camera = errors.camera
     g = camera.slopes(pixels, g)
     pace = max(spacing / 3, 1.0)
     at_x, at_y = (np.linspace(0, n - 1, max(int(np.ceil((n - 1) / pace)) + 1, 2)) for n in (shape[1], shape[0]))
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
-    slope = np.stack([spline.evaluate(f.grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
+    slope = np.stack([spline.evaluate(grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
     slope = camera.slopes(points, slope)
     spread = confidence.spread(errors, points, slope)
     sigma = np.degrees(confidence.angle(errors, points, slope, spread)).reshape(len(at_y), len(at_x))
-    height = spline.evaluate(f.grid, a, at_x, at_y).ravel()
-    index, stencil = spline.stencil(f.grid, xy)
+    height = spline.evaluate(grid, a, at_x, at_y).ravel()
+    index, stencil = spline.stencil(grid, xy)
     seen = np.concatenate((xy, (stencil * a[index]).sum(1, keepdims=True)), 1)
     far = distance(seen, np.concatenate((points, height[:, None]), 1)).reshape(sigma.shape) / reach
     far /= np.where(surrounded(xy, points).reshape(far.shape), 1.0, BEYOND)
     sigma, far = (_enlarge(v, shape) for v in (sigma, far))
     return {
-        "height": camera.height(pixels, spline.evaluate(f.grid, a, columns, rows)),
+        "height": camera.height(pixels, spline.evaluate(grid, a, columns, rows)),
         "normals": camera.turn(pixels, tensors.normals(g)),
         "sigma": sigma,
         "supported": (far <= 1) & (sigma <= WORST),

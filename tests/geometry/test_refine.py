@@ -77,14 +77,14 @@ def test_support_follows_the_surface_and_leaves_holes():
     hole = np.hypot(xy[:, 0] - 150, xy[:, 1] - 150) < 80
     xy = xy[~hole] + rng.normal(size=(int((~hole).sum()), 2))
     f, errors = sure_errors(xy)
-    maps = support.dense(f, np.zeros(f.grid.size), (300, 300), xy, 20.0, errors, support.reach(xy, 20.0))
+    maps = support.dense(f.grid, np.zeros(f.grid.size), (300, 300), xy, 20.0, errors, support.reach(xy, 20.0))
     assert not maps["supported"][150, 150] and maps["supported"][20, 20] and maps["supported"][299, 150]
     assert 0.6 < maps["supported"].mean() < 0.95
     assert maps["sigma"][150, 150] > 2 * maps["sigma"][30, 30]
     assert np.allclose(maps["normals"], [0, 0, 1])
     # The same instances on a steep slope are further apart on the surface, and reach less far in the image.
     steep = np.linalg.lstsq(spline.design(f.grid, xy).toarray(), 3 * xy[:, 0], rcond=None)[0]
-    there = support.dense(f, steep, (300, 300), xy, 20.0, errors, support.reach(xy, 20.0))
+    there = support.dense(f.grid, steep, (300, 300), xy, 20.0, errors, support.reach(xy, 20.0))
     assert there["supported"].mean() < maps["supported"].mean()
 
 
@@ -122,7 +122,7 @@ def test_a_place_a_little_out_of_reach_is_closed(radius, closed):
     x, y = np.meshgrid(np.arange(10.0, 300, 20), np.arange(10.0, 300, 20))
     xy = np.stack((x.ravel(), y.ravel()), 1)
     f, errors = sure_errors(xy[np.hypot(xy[:, 0] - 150, xy[:, 1] - 150) > radius])
-    maps = support.dense(f, np.zeros(f.grid.size), (300, 300), errors.xy, 20.0, errors, support.reach(xy, 20.0))
+    maps = support.dense(f.grid, np.zeros(f.grid.size), (300, 300), errors.xy, 20.0, errors, support.reach(xy, 20.0))
     assert not maps["supported"][150, 150]
     assert support.close_holes(maps["supported"], maps["closable"])[150, 150] == closed
 
@@ -157,7 +157,7 @@ def test_what_a_texton_has_wrong_widens_the_spread_as_much_as_it_errs():
     for seed in range(12):
         f, s, nodes, w, stated, _, g, texton = refined(np.random.default_rng(seed), 1000, shear=0.03, noise=0.002)
         residual, _ = confidence.residuals(w, stated, g)
-        moved = confidence.influence(f, s, nodes, residual, texton)
+        moved = confidence.influence(s, nodes, residual, texton)
         index, stencil = ORTHOGRAPHIC.stencil(f.grid, at)
         slope = np.einsum("npk,nk->np", stencil, s.a[index])
         actual.append(((slope - [0.8, 0.3]) ** 2).sum(1).mean())
