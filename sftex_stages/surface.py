@@ -116,7 +116,7 @@ class Instances:
 
 @dataclass(frozen=True)
 class Fit:
-    """A refined surface, and the instances, the nodes and the measured heights it was refined from, as `camera` sees them; nats by
+    """A refined surface; the instances, nodes and measured heights it was refined from, as `camera` sees them; and nats by
     which the prior of curvature beat that of heights."""
 
     instances: Instances

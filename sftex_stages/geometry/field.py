@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sftex_stages.geometry import blocks, gaussian, pooling, spline
-from sftex_stages.geometry.refine import climb
+from sftex_stages.geometry.climb import climb
 
 Float = NDArray[np.floating]
 Int = NDArray[np.integer]

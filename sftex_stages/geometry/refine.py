@@ -5,7 +5,6 @@ with `w` of `tensors.py`, Omega_i the measured precision over a common noise fac
 that what is not from the surface loses its say. Smoothness and noise factor maximise the marginal likelihood (Laplace).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from sftex_stages.geometry import blocks, curvature, gaussian, roughness, tensors
 from sftex_stages.geometry.camera import Camera
+from sftex_stages.geometry.climb import climb
 
 Float = NDArray[np.floating]
 
@@ -162,19 +162,6 @@ def refine_locally(
         start, smooth, noise = found.gradient, found.smooth, found.noise
         found = refine(shaped, w, covariance, trust, start, smooth, rounds, height, noise, found.height_noise, tune=False)
     return found
-
-
-def climb(score: Callable[[Float], float], x: Float, pace: Float) -> tuple[Float, bool]:
-    """One round of pattern search: the first better neighbour of `x` (K,) at ±`pace` (K,) along every axis in turn."""
-    value, moved = score(x), False
-    for k in range(len(x)):
-        for sign in (1, -1):
-            trial = x + sign * pace * (np.arange(len(x)) == k)
-            new = score(trial)
-            if new > value:
-                x, value, moved = trial, new, True
-                break
-    return x, moved
 
 
 def limit(g: Float, steepest: float = 12.0) -> Float:

@@ -30,7 +30,7 @@ from sftex_stages.geometry import (
     surface_em,
     tensors,
 )
-from sftex_stages.geometry.refine import climb
+from sftex_stages.geometry.climb import climb
 
 Float = NDArray[np.floating]
 Int = NDArray[np.integer]
