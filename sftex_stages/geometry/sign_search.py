@@ -1,13 +1,13 @@
 """Many starts, several smoothnesses, every cue, one measure: the search for the sign pattern of greatest evidence.
 
 Every smoothness of a ladder, smooth to rough, anneals all starts (leading eigenvectors, the paper's cylinder in four
-directions, leaning planes, a bowl, lights from six azimuths), with and without shading, moves whole regions, and hands its
+directions, leaning planes, a bowl, lights from six azimuths), those of lights with shading, moves whole regions, and hands its
 patterns on as starts of the next. Under every camera that may have been there it does so as well from what the elements'
 sizes say of heights, which are in the energy then. The best distinct patterns flip regions of every size
 (`sign_regions.py`) and are judged by their evidence, each under the camera that sizes speak for, with its own best
 smoothness and noise and with outliers let go, so that patterns found with different settings compare. Those that come near
-the best are reconsidered under a prior that is rough where their surface is (`roughness.py`), too: one smoothness for all
-prefers patterns that iron folds out.
+the best are reconsidered under priors of their own surface, of its curvature (`curvature.py`), and rough where it is
+(`roughness.py`): one smoothness of all heights prefers patterns that iron folds out.
 """
 
 from dataclasses import dataclass, replace
@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from sftex_stages.geometry import (
     blocks,
+    curvature,
     gaussian,
     perspective,
     roughness,
@@ -30,6 +31,7 @@ from sftex_stages.geometry import (
     surface_em,
     tensors,
 )
+from sftex_stages.geometry.camera import ORTHOGRAPHIC
 from sftex_stages.geometry.climb import climb
 
 Float = NDArray[np.floating]
@@ -85,9 +87,10 @@ class Candidate:
     light: shading.Light | None
     origin: str
     tuned: bool  # whether smoothness and noise were searched for it, or are those it was found at
-    rough: Float | None = None  # factors of the prior's cells (`roughness.py`)
     view: View | None = None  # under which it was judged; None: orthography
     height_noise: float = 1.0
+    about: Float | None = None  # coefficients of the surface whose curvature the prior charges for (`curvature.py`)
+    rough: Float | None = None  # factors of the prior's cells (`roughness.py`)
 
     @property
     def evidence(self) -> float:
@@ -254,6 +257,7 @@ def judge(
         rest = (1 - q) * (data.log_outlier + np.log(OUTLIER) - np.log(1 - q)) + q * (np.log1p(-OUTLIER) - np.log(q))
         return value + float(rest.sum()) - 0.5 * max(float(np.log(factor)) / EXCESS, 0.0) ** 2
 
+    smooth = gaussian.softened(f, smooth)
     best = np.log([smooth.strength, smooth.reach, noise])
     pace = np.array([0.7, 0.7, 0.7])
     for n in range(rounds + 1):
@@ -278,18 +282,21 @@ def judge(
     told, height_noise = (perspective.CHANCE, 1.0) if view is None else view.seen.fit(gaussian.heights(f, a))
     size = max(told - perspective.CHANCE, 0.0)
     return Candidate(
-        s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0, None, view, height_noise
+        s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0, view, height_noise
     )
 
 
-def judge_again(x: Candidate, data: Data, f: gaussian.Field, s: Float) -> Candidate:
-    """The evidence of the signs `s` (N,), from the settings of `x` on."""
-    return judge(data, f, s, x.smooth, x.noise, 2, x.origin, x.view)
+def judge_again(data: Data, f: gaussian.Field, x: Candidate, s: Float) -> Candidate:
+    """The evidence of the signs `s` (N,) under the prior of `x`, from its settings on."""
+    again = judge(*scene(data, f, x), s, x.smooth, x.noise, 2, x.origin, x.view)
+    return replace(again, about=x.about, rough=x.rough)
 
 
 def scene(data: Data, f: gaussian.Field, x: Candidate) -> tuple[Data, gaussian.Field]:
-    """The nodes and the field as the candidate has them."""
-    return (data, f) if x.view is None else (x.view.data, x.view.field)
+    """The nodes and the field as the candidate's camera has them, with the prior that it was judged under."""
+    data, f = (data, f) if x.view is None else (x.view.data, x.view.field)
+    f = f if x.about is None else curvature.follow(f, x.about, ORTHOGRAPHIC if x.view is None else x.view.seen.camera)
+    return data, roughness.shaped(f, x.rough)
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -342,9 +349,6 @@ def search(
             sized = from_sizes(view, smooth, labels, hot)
             patterns, names = np.concatenate((patterns, sized), 1), names + ["sizes"] * sized.shape[1]
             lit = np.concatenate((lit, np.arange(sized.shape[1]) > 0))
-        if data.shading is not None:  # every pattern may go on with the shading, and without
-            patterns, names = np.concatenate((patterns, patterns), 1), names + names
-            lit = np.concatenate((lit, ~lit))
         shape = 0.5 * c.log_det - signs.energies(c, patterns, np.zeros_like(patterns))
         found = signs.surface_of(c, patterns)
         told = [size_of(data, gaussian.heights(f, found[:, j]))[0] for j in range(len(names))]
@@ -356,9 +360,7 @@ def search(
     first = [judge_as_seen(data, f, s, smooth, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
     moved = [settle(data, f, x) for x in first[:finalists]]
-    last = [
-        judge_again(first[k], *scene(data, f, first[k]), moved[k]) for k in distinct(np.stack(moved, 1), data.trust, 0.995)
-    ]
+    last = [judge_again(data, f, first[k], moved[k]) for k in distinct(np.stack(moved, 1), data.trust, 0.995)]
     best = max(x.evidence for x in last)
     near = [x for x in last if x.evidence > best - AFTERTHOUGHT]
     behind = [replace(x, tuned=False) for x in last if x.evidence <= best - AFTERTHOUGHT]
@@ -367,7 +369,8 @@ def search(
 
 
 def reconsider(data: Data, f: gaussian.Field, found: list[Candidate], pairs: tuple[Int, Int]) -> list[Candidate]:
-    """The candidates under a prior that is rough where their own surface is; their evidence includes what that costs.
+    """The candidates under priors of their own surface: of its curvature or of its heights, and rough where it is, each where
+    that has the greater evidence, which includes what local roughness costs.
 
     What they disagree in are regions (of the graph of `pairs`) that may be exchanged: each takes over what helps it.
     """
@@ -385,28 +388,30 @@ def disputed(patterns: Float, trust: Float, pairs: tuple[Int, Int]) -> Int:
 
 
 def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool) -> Candidate:
-    """One pass of `reconsider`; the `last` one states the evidence at the roughness of the surface found."""
-    data, f = scene(data, f, x)
-    c = own_coupling(data, f, x)
-    learned = roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth)
-    x = replace(x, rough=learned.factor)
+    """One pass of `reconsider`; the `last` one states the evidence at the roughness of the surface found, or without."""
+    a = signs.surface_of(own_coupling(data, f, x), x.s)
+    plain, curved = replace(x, about=None, rough=None), replace(x, about=a, rough=None)
+    x = max((judge_again(data, f, y, x.s) for y in (plain, curved)), key=lambda y: y.evidence)
+    c, (seen, field) = own_coupling(data, f, x), scene(data, f, x)
+    rough = replace(x, rough=roughness.learn(field, signs.surface_of(c, x.s), c.factor, x.smooth).factor)
     if 0 < label.max() < MOST_REGIONS:
-        c = own_coupling(data, f, x)
-        x = replace(x, s=signs.flip_regions(c, x.s, own_bias(data, c, x.s), label))
-    s = settle(data, f, x)
-    x = replace(judge_again(x, data, learned.field, s), rough=learned.factor)
+        c = own_coupling(data, f, rough)
+        rough = replace(rough, s=signs.flip_regions(c, rough.s, own_bias(seen, c, rough.s), label))
+    s = settle(data, f, rough)
+    rough = judge_again(data, f, rough, s)
     if not last:
-        return x
-    c = own_coupling(data, f, x)
-    return replace(x, shape=x.shape + roughness.learn(f, signs.surface_of(c, x.s), c.factor, x.smooth).bound)
+        return rough
+    c = own_coupling(data, f, rough)
+    cost = roughness.learn(field, signs.surface_of(c, rough.s), c.factor, rough.smooth).bound
+    return max(replace(rough, shape=rough.shape + cost), judge_again(data, f, x, s), key=lambda y: y.evidence)
 
 
 def own_coupling(data: Data, f: gaussian.Field, found: Candidate) -> signs.Coupling:
-    """The coupling at the candidate's own view, smoothness, roughness and noise, without its outliers."""
+    """The coupling at the candidate's own view, prior and noise, without its outliers."""
     data, f = scene(data, f, found)
     weight = np.linalg.inv(data.covariance) * (found.inside / found.noise)[:, None, None]
     height = None if data.heights is None else data.heights.over(found.height_noise)
-    return signs.coupling(roughness.shaped(f, found.rough), data.d, weight, found.smooth, height)
+    return signs.coupling(f, data.d, weight, found.smooth, height)
 
 
 def rivals(data: Data, c: signs.Coupling, s: Float) -> tuple[list[Int], Float]:
@@ -427,8 +432,8 @@ def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) ->
 
     Energies are those of its own smoothness, noise and outliers.
     """
-    data, f = scene(data, f, found)
     c = own_coupling(data, f, found)
+    data, f = scene(data, f, found)
     pairs, s = neighbours(data.xy), found.s
     for _ in range(rounds):
         bias = own_bias(data, c, s)
