@@ -265,7 +265,7 @@ def look_again(
 ) -> Arrays:
     """The instances `rows` registered again as the surface of coefficients `a` (M,) shows them (`direct.py`)."""
     xy = rows["xy"].astype(float)
-    slope = refine.limit(camera.slopes_of(grid, a, xy), STEEP)
+    slope = tensors.limit(camera.slopes_of(grid, a, xy), STEEP)
     p = direct.foreshortening(slope, camera, xy)
     rgb = inputs["image"]["rgb"]
     rows = {name: value.copy() for name, value in rows.items()}

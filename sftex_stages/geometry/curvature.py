@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sftex_stages.geometry import gaussian, roughness, spline
+from sftex_stages.geometry import gaussian, roughness, spline, tensors
 from sftex_stages.geometry.camera import Camera
 
 Float = NDArray[np.floating]
@@ -41,8 +41,7 @@ def about(grid: spline.Grid, a: Float, camera: Camera) -> tuple[Float, Float]:
     W, metric and p are those at the middle of the cell, of slopes relative to the rays of `camera`.
     """
     at, index = spline.centres(grid), spline.cells(grid)
-    g = camera.slopes_of(grid, a, at)
-    g = g * np.minimum(1, STEEPEST / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12))
+    g = tensors.limit(camera.slopes_of(grid, a, at), STEEPEST)
     second = np.stack([np.einsum("ck,ck->c", spline.stencil(grid, at, *d)[1], a[index]) for d in SECOND], 1)
     w2 = 1 + (g**2).sum(1)
     p = np.einsum("cij,cj->ci", second[:, _IJ], g) / w2[:, None]

@@ -103,7 +103,7 @@ def refine(
         if given, every round but the first has the prior of curvature about the surface of the last (`curvature.py`).
     """
     precision = np.linalg.inv(covariance)
-    g, robust = limit(start), trust.copy()
+    g, robust = tensors.limit(start), trust.copy()
     smooth, noise = gaussian.softened(f, smooth), float(np.clip(noise, *NOISE_FACTORS))
     noises, rises = np.log(NOISE_FACTORS), np.log(HEIGHT_FACTORS)
     x, pace = np.log([smooth.strength, smooth.reach, noise]), np.array([0.7, 0.7, 0.7])
@@ -131,10 +131,10 @@ def refine(
         for _ in range(2):
             omega = precision * (robust / noise)[:, None, None]
             a, factor, information, pull = step(f, w, omega, g, smooth, rise(x))
-            g = limit(gaussian.gradients(f, a))
+            g = tensors.limit(gaussian.gradients(f, a))
         spread = gaussian.gradient_covariance(f, factor)
         mean, alone = gaussian.without_own(g, spread, information, pull)
-        robust = trust * student(w, precision / noise, limit(mean), alone)[0]
+        robust = trust * student(w, precision / noise, tensors.limit(mean), alone)[0]
         if camera is not None and k < rounds - 1:
             f = curvature.follow(f, a, camera)
             x[0] = np.log(gaussian.softened(f, smooth).strength)
@@ -162,12 +162,6 @@ def refine_locally(
         start, smooth, noise = found.gradient, found.smooth, found.noise
         found = refine(shaped, w, covariance, trust, start, smooth, rounds, height, noise, found.height_noise, tune=False)
     return found
-
-
-def limit(g: Float, steepest: float = 12.0) -> Float:
-    """Gradients (N, 2) no steeper than `steepest`, where the tensor no longer changes."""
-    size = np.linalg.norm(g, axis=1, keepdims=True)
-    return g * np.minimum(1, steepest / np.maximum(size, 1e-12))
 
 
 def flipped(s: Solution) -> Solution:

@@ -83,3 +83,9 @@ def angular_error(g: Float, covariance: Float) -> Float:
             other = normals(g + sign * out[..., k])
             total += np.arctan2(np.linalg.norm(np.cross(n, other), axis=-1), (n * other).sum(-1)) ** 2
     return np.sqrt(total / 4)
+
+
+def limit(g: Float, steepest: float = 12.0) -> Float:
+    """Gradients (N, 2) no steeper than `steepest`, where the tensor no longer changes."""
+    size = np.linalg.norm(g, axis=1, keepdims=True)
+    return g * np.minimum(1, steepest / np.maximum(size, 1e-12))
