@@ -233,7 +233,7 @@ def run(inputs: Mapping[str, Any], params: Params) -> Arrays:
     candidates = find(data, coarse, spacing, params.finalists, params.start)
     best = candidates[0]
     start = gaussian.gradients(coarse, best.a)
-    coupled = sign_search.own_coupling(data, coarse, best)
+    coupled = sign_search.own_coupling(best)
     regions, rise = sign_search.rivals(data, coupled, best.s)
     margin = np.append(sign_regions.margins(regions, rise, len(best.s)), np.nan)[nodes.member]
     choice = choose_camera(nodes, coarse.grid, start, best, sizes, inputs["image"], params)

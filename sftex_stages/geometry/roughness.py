@@ -60,10 +60,8 @@ def energies(f: gaussian.Field) -> tuple[Float, Float]:
     return second, third
 
 
-def shaped(f: gaussian.Field, factor: Float | None) -> gaussian.Field:
-    """The field with the energies of its cells multiplied by `factor` (C,); None: as it is."""
-    if factor is None:
-        return f
+def shaped(f: gaussian.Field, factor: Float) -> gaussian.Field:
+    """The field with the energies of its cells multiplied by `factor` (C,)."""
     add = gaussian.scatter(f.grid, spline.cells(f.grid))
     local = [add(factor[:, None, None] * e) for e in energies(f)]
     return replace(f, energies=(*f.energies[:2], *local), logdets={})

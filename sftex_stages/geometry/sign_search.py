@@ -87,10 +87,10 @@ class Candidate:
     light: shading.Light | None
     origin: str
     tuned: bool  # whether smoothness and noise were searched for it, or are those it was found at
-    view: View | None = None  # under which it was judged; None: orthography
+    data: Data  # the nodes, and
+    field: gaussian.Field  # with its prior, the field, that it was judged with
+    view: View | None = None  # whose they are; None: orthography
     height_noise: float = 1.0
-    about: Float | None = None  # coefficients of the surface whose curvature the prior charges for (`curvature.py`)
-    rough: Float | None = None  # factors of the prior's cells (`roughness.py`)
 
     @property
     def evidence(self) -> float:
@@ -282,21 +282,13 @@ def judge(
     told, height_noise = (perspective.CHANCE, 1.0) if view is None else view.seen.fit(gaussian.heights(f, a))
     size = max(told - perspective.CHANCE, 0.0)
     return Candidate(
-        s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0, view, height_noise
+        s, score(best), shade, size, smooth, factor, inside, a, light, origin, rounds > 0, data, f, view, height_noise
     )
 
 
-def judge_again(data: Data, f: gaussian.Field, x: Candidate, s: Float) -> Candidate:
+def judge_again(x: Candidate, s: Float) -> Candidate:
     """The evidence of the signs `s` (N,) under the prior of `x`, from its settings on."""
-    again = judge(*scene(data, f, x), s, x.smooth, x.noise, 2, x.origin, x.view)
-    return replace(again, about=x.about, rough=x.rough)
-
-
-def scene(data: Data, f: gaussian.Field, x: Candidate) -> tuple[Data, gaussian.Field]:
-    """The nodes and the field as the candidate's camera has them, with the prior that it was judged under."""
-    data, f = (data, f) if x.view is None else (x.view.data, x.view.field)
-    f = f if x.about is None else curvature.follow(f, x.about, ORTHOGRAPHIC if x.view is None else x.view.seen.camera)
-    return data, roughness.shaped(f, x.rough)
+    return judge(x.data, x.field, s, x.smooth, x.noise, 2, x.origin, x.view)
 
 
 def _inside(data: Data, residual: Float, alone: Float, noise: float) -> Float:
@@ -359,24 +351,25 @@ def search(
         pool += [(float(value[j]), patterns[:, n], smooth, names[n]) for n, j in enumerate(order)]
     first = [judge_as_seen(data, f, s, smooth, 0, name) for _, s, smooth, name in shortlist(pool, data, 3 * finalists)]
     first.sort(key=lambda x: -x.evidence)
-    moved = [settle(data, f, x) for x in first[:finalists]]
-    last = [judge_again(data, f, first[k], moved[k]) for k in distinct(np.stack(moved, 1), data.trust, 0.995)]
+    moved = [settle(x) for x in first[:finalists]]
+    last = [judge_again(first[k], moved[k]) for k in distinct(np.stack(moved, 1), data.trust, 0.995)]
     best = max(x.evidence for x in last)
     near = [x for x in last if x.evidence > best - AFTERTHOUGHT]
     behind = [replace(x, tuned=False) for x in last if x.evidence <= best - AFTERTHOUGHT]
-    last = sorted([*reconsider(data, f, near, pairs), *near], key=lambda x: -x.evidence)
+    last = sorted([*reconsider(near, pairs), *near], key=lambda x: -x.evidence)
     return last + behind + first[finalists:]
 
 
-def reconsider(data: Data, f: gaussian.Field, found: list[Candidate], pairs: tuple[Int, Int]) -> list[Candidate]:
+def reconsider(found: list[Candidate], pairs: tuple[Int, Int]) -> list[Candidate]:
     """The candidates under priors of their own surface: of its curvature or of its heights, and rough where it is, each where
-    that has the greater evidence, which includes what local roughness costs.
+    that has the greater evidence, which includes what local roughness costs. They come as judged under the prior of heights.
 
     What they disagree in are regions (of the graph of `pairs`) that may be exchanged: each takes over what helps it.
     """
+    plain = [x.field for x in found]
     for n in range(PASSES):
-        label = disputed(np.stack([x.s for x in found], 1), data.trust, pairs)
-        found = [_rethink(data, f, x, label, last=n == PASSES - 1) for x in found]
+        label = disputed(np.stack([x.s for x in found], 1), found[0].data.trust, pairs)
+        found = [_rethink(x, f, label, last=n == PASSES - 1) for x, f in zip(found, plain, strict=True)]
     return found
 
 
@@ -387,31 +380,31 @@ def disputed(patterns: Float, trust: Float, pairs: tuple[Int, Int]) -> Int:
     return components(len(patterns), pairs, (relative[pairs[0]] == relative[pairs[1]]).all(1))
 
 
-def _rethink(data: Data, f: gaussian.Field, x: Candidate, label: Int, last: bool) -> Candidate:
-    """One pass of `reconsider`; the `last` one states the evidence at the roughness of the surface found, or without."""
-    a = signs.surface_of(own_coupling(data, f, x), x.s)
-    plain, curved = replace(x, about=None, rough=None), replace(x, about=a, rough=None)
-    x = max((judge_again(data, f, y, x.s) for y in (plain, curved)), key=lambda y: y.evidence)
-    c, (seen, field) = own_coupling(data, f, x), scene(data, f, x)
-    rough = replace(x, rough=roughness.learn(field, signs.surface_of(c, x.s), c.factor, x.smooth).factor)
+def _rethink(x: Candidate, plain: gaussian.Field, label: Int, last: bool) -> Candidate:
+    """One pass of `reconsider`, from the `plain` field, with the prior of heights; the `last` pass states the evidence at the
+    roughness of the surface found, or without."""
+    a = signs.surface_of(own_coupling(x), x.s)
+    curved = curvature.follow(plain, a, ORTHOGRAPHIC if x.view is None else x.view.seen.camera)
+    x = max((judge_again(replace(x, field=f), x.s) for f in (plain, curved)), key=lambda y: y.evidence)
+    c = own_coupling(x)
+    rough = replace(x, field=roughness.learn(x.field, signs.surface_of(c, x.s), c.factor, x.smooth).field)
     if 0 < label.max() < MOST_REGIONS:
-        c = own_coupling(data, f, rough)
-        rough = replace(rough, s=signs.flip_regions(c, rough.s, own_bias(seen, c, rough.s), label))
-    s = settle(data, f, rough)
-    rough = judge_again(data, f, rough, s)
+        c = own_coupling(rough)
+        rough = replace(rough, s=signs.flip_regions(c, rough.s, own_bias(rough.data, c, rough.s), label))
+    s = settle(rough)
+    rough = judge_again(rough, s)
     if not last:
         return rough
-    c = own_coupling(data, f, rough)
-    cost = roughness.learn(field, signs.surface_of(c, rough.s), c.factor, rough.smooth).bound
-    return max(replace(rough, shape=rough.shape + cost), judge_again(data, f, x, s), key=lambda y: y.evidence)
+    c = own_coupling(rough)
+    cost = roughness.learn(x.field, signs.surface_of(c, rough.s), c.factor, rough.smooth).bound
+    return max(replace(rough, shape=rough.shape + cost), judge_again(x, s), key=lambda y: y.evidence)
 
 
-def own_coupling(data: Data, f: gaussian.Field, found: Candidate) -> signs.Coupling:
+def own_coupling(x: Candidate) -> signs.Coupling:
     """The coupling at the candidate's own view, prior and noise, without its outliers."""
-    data, f = scene(data, f, found)
-    weight = np.linalg.inv(data.covariance) * (found.inside / found.noise)[:, None, None]
-    height = None if data.heights is None else data.heights.over(found.height_noise)
-    return signs.coupling(f, data.d, weight, found.smooth, height)
+    weight = np.linalg.inv(x.data.covariance) * (x.inside / x.noise)[:, None, None]
+    height = None if x.data.heights is None else x.data.heights.over(x.height_noise)
+    return signs.coupling(x.field, x.data.d, weight, x.smooth, height)
 
 
 def rivals(data: Data, c: signs.Coupling, s: Float) -> tuple[list[Int], Float]:
@@ -427,14 +420,13 @@ def ties(data: Data, c: signs.Coupling, s: Float, piece: Int) -> tuple[Float, Fl
     return member.T @ signs.product(c, member), member.T @ bias
 
 
-def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) -> Float:
+def settle(found: Candidate, rounds: int = 12) -> Float:
     """The signs (N,) of `found` after flips of regions of all sizes, as long as one helps.
 
     Energies are those of its own smoothness, noise and outliers.
     """
-    c = own_coupling(data, f, found)
-    data, f = scene(data, f, found)
-    pairs, s = neighbours(data.xy), found.s
+    c, data, s = own_coupling(found), found.data, found.s
+    pairs = neighbours(data.xy)
     for _ in range(rounds):
         bias = own_bias(data, c, s)
         regions, rise = sign_regions.rivals(c, data.d, s, bias, pairs)
@@ -445,7 +437,7 @@ def settle(data: Data, f: gaussian.Field, found: Candidate, rounds: int = 12) ->
         s[regions[best]] *= -1
         s = signs.descend(c, s[:, None], bias[:, None])[:, 0]
     # What did not fit the former pattern had no say, and no energy of its own: it follows the surface.
-    g = gaussian.gradients(f, signs.surface_of(c, s))
+    g = gaussian.gradients(found.field, signs.surface_of(c, s))
     lost = (found.inside < 0.5 * data.trust) & ((data.d * g).sum(1) * s < 0)
     return np.where(lost, -s, s)
 

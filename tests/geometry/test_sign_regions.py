@@ -61,11 +61,11 @@ def test_a_wrong_region_that_single_flips_cannot_mend_is_turned(problem):
     stuck = signs.descend(c, wrong[:, None], np.zeros((168, 1)))[:, 0]
     assert abs(stuck.sum()) < 168
     found = sign_search.judge(data, f, stuck, smooth, 1.0, 0, "stuck")
-    settled = sign_search.settle(data, f, found)
+    settled = sign_search.settle(found)
     flat = np.linalg.norm(data.d, axis=1) < 0.06  # whose sign is noise
     assert len(np.unique(settled[~flat])) == 1
     right = sign_search.judge(data, f, settled, smooth, 1.0, 0, "right")
     assert right.evidence > found.evidence + 20
-    assert len(np.unique(sign_search.settle(data, f, right)[~flat])) == 1
-    regions, rise = sign_search.rivals(data, sign_search.own_coupling(data, f, right), right.s)
+    assert len(np.unique(sign_search.settle(right)[~flat])) == 1
+    regions, rise = sign_search.rivals(data, sign_search.own_coupling(right), right.s)
     assert sign_regions.margins(regions, rise, 168)[~flat].min() > 1

@@ -154,7 +154,7 @@ def test_patterns_that_are_wrong_in_different_places_mend_one_another():
     assert all(len(set(wrong[label == k])) == 1 for k in np.unique(label)) and label.max() >= 1
     smooth = gaussian.Smoothness(1.0, 40.0)
     given = [sign_search.judge(data, f, s, smooth, 1.0, 2, "given") for s in patterns.T]
-    found = sign_search.reconsider(data, f, given, pairs)
+    found = sign_search.reconsider(given, pairs)
     assert all(abs((x.s * truth).mean()) > 0.99 for x in found)
     assert all(x.evidence > y.evidence for x, y in zip(found, given, strict=True))
 
@@ -164,10 +164,10 @@ def test_roughness_of_its_own_is_in_a_candidates_coupling():
     f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 10.0), xy)
     data = data_of(xy, d, covariance, None)
     plain = sign_search.judge(data, f, truth, gaussian.Smoothness(1.0, 40.0), 1.0, 1, "truth")
-    found = sign_search.reconsider(data, f, [plain], sign_search.neighbours(xy))[0]
-    c = sign_search.own_coupling(data, f, found)
+    found = sign_search.reconsider([plain], sign_search.neighbours(xy))[0]
+    c = sign_search.own_coupling(found)
     assert np.allclose(signs.surface_of(c, found.s), found.a, rtol=0.05, atol=0.05 * np.abs(found.a).max())
-    assert not np.allclose(c.factor.band, sign_search.own_coupling(data, f, plain).factor.band)
+    assert not np.allclose(c.factor.band, sign_search.own_coupling(plain).factor.band)
 
 
 def folds(count, seed, noise):
