@@ -497,12 +497,12 @@ def outputs(
     g = camera.slopes_of(grid, solution.a, instances.xy)
     k, found = instances.trust > 0, instances.calibration
     residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
-    moved = confidence.influence(solution, fit.nodes, residual, instances.texton)
+    transform = camera.flatten(instances.xy) @ table["transform"].astype(float)
+    shear = found.common * calibration.shear_effect(transform)[1]
+    moved = confidence.influence(solution, fit.nodes, residual, instances.texton, shear, instances.xy)
     inverse = blocks.selected_inverse(solution.factor)
-    errors = confidence.Errors(
-        instances.xy[k], residual[k], chi2[k], found.common, moved, grid, inverse, camera, other
-    )
-    spread = confidence.spread(errors, instances.xy, g)
+    errors = confidence.Errors(instances.xy[k], chi2[k], moved, grid, inverse, camera, other)
+    spread = confidence.spread(errors, instances.xy)
     sigma = confidence.angle(errors, instances.xy, g, spread)
     normal = resolve(instances, g)
     off = np.linalg.norm(normal - tensors.normals(g), axis=1)  # in radians, but for a third order
@@ -599,4 +599,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=18, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=19, params=Params, run=run, inputs=("image", "frontal", "enrich"))

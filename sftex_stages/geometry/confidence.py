@@ -4,12 +4,13 @@ The posterior takes errors as independent and of one size everywhere. They are n
 its frontal frame and its registration got wrong; where elements are small against a fold they are not flat, on a rim not
 modelled at all. The instances themselves show it, by their residuals against the surface:
 
-- texton by texton, in what each moves the surface (the cluster-robust covariance of Liang & Zeger 1986: `influence`);
+- texton by texton, in what each moves the surface (the cluster-robust covariance of Liang & Zeger 1986);
 - nearby, in their scatter (the noise there) and in their mean (what the surface does not follow).
 
-Under perspective the focal length is known only so well: what the surface would be under another goes in as it is.
+What all textons have wrong together shows in no residual; `calibration.py` estimates it. It is taken through the fit as well:
+where the surface faces the camera a tensor hardly says how it leans, and its error there is that of the places around.
 
-What all textons have wrong together shows in no residual; `calibration.py` estimates it.
+Under perspective the focal length is known only so well: what the surface would be under another goes in as it is.
 """
 
 from dataclasses import dataclass
@@ -29,10 +30,10 @@ Int = NDArray[np.integer]
 NEAR, WIDE = 24, 256  # instances that speak for a place; and for its surroundings
 UPPER_QUARTILE = float(np.log(4.0))  # of half a chi-square of two degrees of freedom
 NOISE_FACTORS = (0.005, 20.0)
-# Textons on one printed motif err together, so that fewer are independent; of what instances nearby err in common a quarter is
-# the surface's, the rest their own (they often lie on one motif). Round numbers, the same for all images; chosen among some
-# hundred settings on the benchmark's images and forty scenes drawn at random.
-TEXTONS, MISFIT = 1.5, 0.25
+# Textons on one printed motif err together, so that fewer are independent; what instances nearby err in common tells half of
+# what they may have in common everywhere. Round numbers, the same for all images; chosen among some hundred settings on the
+# benchmark's images and sixty-eight scenes drawn at random.
+TEXTONS, MISFIT = 1.5, 0.5
 CHUNK = 4096  # places at a time: bounded memory
 
 
@@ -46,14 +47,11 @@ class Other:
 
 @dataclass(frozen=True)
 class Errors:
-    """Instances believed: places `xy` (N, 2), residuals of w (N, 2), half their squares over the stated variance (N,); the
-    standard deviation of w that all textons share; `influence` (M, K) of the textons on the surface's coefficients, and the
-    surface's grid, camera and selected inverse (`blocks.py`)."""
+    """Of instances believed the places `xy` (N, 2) and half the squared residuals over the stated variance (N,); `influence`
+    (M, K) of errors that instances share; the surface's grid, selected inverse (`blocks.py`) and camera."""
 
     xy: Float
-    residual: Float
     chi2: Float
-    common: float
     influence: Float
     grid: spline.Grid
     inverse: tuple[Float, Float]
@@ -63,13 +61,6 @@ class Errors:
     @cached_property
     def tree(self) -> cKDTree:
         return cKDTree(self.xy)
-
-    @cached_property
-    def misfit(self) -> float:
-        """Root mean square, over the image, of what instances nearby err in common."""
-        at = self.xy[:: max(1, len(self.xy) // CHUNK)]
-        near = self.tree.query(at, min(NEAR, len(self.xy)))[1].reshape(len(at), -1)
-        return float(np.sqrt((np.median(self.residual[near], axis=1) ** 2).mean()))
 
     def noise(self, at: Float) -> Float:
         """Factor (P,) on the stated noise that the residuals show about `at` (P, 2): of those next to it and of those in the
@@ -85,36 +76,55 @@ def residuals(w: Float, covariance: Float, g: Float) -> tuple[Float, Float]:
     return residual, np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual) / 2
 
 
-def influence(solution: refine.Solution, nodes: pooling.Nodes, residual: Float, texton: Int) -> Float:
-    """By how much each texton's residuals move the surface: coefficients (M, K), whose squares add up to a covariance.
+def misfit(xy: Float, residual: Float) -> float:
+    """Root mean square, over the image, of what instances nearby, at `xy` (N, 2) with residuals (N, 2) of w, err in common."""
+    at = xy[:: max(1, len(xy) // CHUNK)]
+    near = cKDTree(xy).query(at, min(NEAR, len(xy)))[1].reshape(len(at), -1)
+    return float(np.sqrt((np.median(residual[near], axis=1) ** 2).mean()))
+
+
+def influence(
+    solution: refine.Solution, nodes: pooling.Nodes, residual: Float, texton: Int, shear: Float, xy: Float
+) -> Float:
+    """By how much what instances have wrong together moves the surface: coefficients (M, K), whose squares add up to a
+    covariance. Columns: the residuals of each texton; S of the `shear` of all; two of a shift of w, by half the `misfit`.
 
     Parameters
     ----------
     solution
         the surface refined on the nodes.
-    residual, texton : (N, 2), (N,)
-        of w against the surface, and number, of the instances that the nodes were pooled from.
+    residual, texton, xy : (N, 2), (N,), (N, 2)
+        of w against the surface, number, and place, of the instances that the nodes were pooled from.
+    shear : (N, 2, S)
+        what w may be off by in all of them together, in S independent ways.
     """
     used = np.flatnonzero(nodes.member >= 0)
     node = nodes.member[used]
+    f, jacobian = solution.field, tensors.predict(solution.gradient)[1]
+    precision = np.linalg.inv(nodes.covariance) * (solution.weight / solution.noise)[:, None, None]
+    gain = (np.swapaxes(jacobian, 1, 2) @ precision)[node] @ nodes.share[used]
+
+    def moved(change: Float, group: Int) -> Float:
+        """The coefficients (M, G), one column a group, that changes of w (n, 2) at the instances used add."""
+        count = int(group.max()) + 1
+        value = np.einsum("npk,npj,nj->nk", f.stencil[node], gain, change, optimize=True)
+        place = (f.index[node] * count + group[:, None]).ravel()
+        right = np.bincount(place, value.ravel(), f.grid.size * count).astype(float, copy=False)
+        return np.asarray(blocks.solve(solution.factor, right.reshape(f.grid.size, count)))
+
     group: Int = np.unique(texton[used], return_inverse=True)[1]
     if group.max() == 0:  # a single texton: its nodes have to do
         group = node
     count = int(group.max()) + 1
-    f, jacobian = solution.field, tensors.predict(solution.gradient)[1]
-    precision = np.linalg.inv(nodes.covariance) * (solution.weight / solution.noise)[:, None, None]
-    gain = np.swapaxes(jacobian, 1, 2) @ precision
-    pull = np.einsum("nij,njk,nk->ni", gain[node], nodes.share[used], residual[used])
-    value = np.einsum("npk,np->nk", f.stencil[node], pull)
-    place = (f.index[node] * count + group[:, None]).ravel()
-    right = np.bincount(place, value.ravel(), f.grid.size * count).astype(float, copy=False)
-    moved = blocks.solve(solution.factor, right.reshape(f.grid.size, count))
-    return np.asarray(moved * np.sqrt(count / max(count - 1, 1)))
+    own = moved(residual[used], group) * np.sqrt(TEXTONS * count / max(count - 1, 1))
+    shift = MISFIT * misfit(xy[used], residual[used]) * np.eye(2)
+    ways = [*np.moveaxis(shear[used], 2, 0), *(np.tile(s, (len(used), 1)) for s in shift)]
+    return np.concatenate((own, *(moved(change, np.zeros_like(node)) for change in ways)), 1)
 
 
-def spread(e: Errors, at: Float, g: Float) -> Float:
-    """Covariance (P, 2, 2) to expect of slopes `g` (P, 2) relative to the rays of `at` (P, 2) px."""
-    parts = [_spread(e, at[k : k + CHUNK], g[k : k + CHUNK]) for k in range(0, len(at), CHUNK)]
+def spread(e: Errors, at: Float) -> Float:
+    """Covariance (P, 2, 2) to expect of the surface's slopes relative to the rays of `at` (P, 2) px."""
+    parts = [_spread(e, at[k : k + CHUNK]) for k in range(0, len(at), CHUNK)]
     return np.concatenate(parts) if parts else np.zeros((0, 2, 2))
 
 
@@ -128,14 +138,10 @@ def angle(e: Errors, at: Float, g: Float, spread: Float) -> Float:
     return np.asarray(np.hypot(own, np.linalg.norm(e.camera.turn(at, tensors.normals(g)) - theirs, axis=-1)))
 
 
-def _spread(e: Errors, at: Float, g: Float) -> Float:
+def _spread(e: Errors, at: Float) -> Float:
     index, stencil = e.camera.stencil(e.grid, at)
     posterior = blocks.covariance(e.inverse, index, stencil, stencil)
-    if not len(e.xy):
-        return posterior + tensors.common_error(g, e.common)
     rows = np.arange(0, 2 * index.size + 1, 16)
     design = sp.csr_matrix((stencil.ravel(), np.repeat(index, 2, 0).ravel(), rows), shape=(2 * len(at), e.grid.size))
     moved = np.asarray(design @ e.influence).reshape(len(at), 2, -1)
-    shared = TEXTONS * moved @ np.swapaxes(moved, 1, 2)
-    own = e.noise(at)[:, None, None] * posterior
-    return np.asarray(shared + own + tensors.common_error(g, np.hypot(MISFIT * e.misfit, e.common)))
+    return np.asarray(moved @ np.swapaxes(moved, 1, 2) + e.noise(at)[:, None, None] * posterior)

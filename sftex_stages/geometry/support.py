@@ -77,7 +77,7 @@ def dense(
     points = np.stack(np.meshgrid(at_x, at_y), -1).reshape(-1, 2)
     slope = np.stack([spline.evaluate(grid, a, at_x, at_y, *d) for d in ((1, 0), (0, 1))], -1).reshape(-1, 2)
     slope = camera.slopes(points, slope)
-    spread = confidence.spread(errors, points, slope)
+    spread = confidence.spread(errors, points)
     sigma = np.degrees(confidence.angle(errors, points, slope, spread)).reshape(len(at_y), len(at_x))
     height = spline.evaluate(grid, a, at_x, at_y).ravel()
     index, stencil = spline.stencil(grid, xy)

@@ -55,13 +55,6 @@ def gradient(w: Float, covariance: Float) -> tuple[Float, Float]:
     return direction * slope(size)[:, None], inverse @ covariance @ np.swapaxes(inverse, 1, 2)
 
 
-def common_error(g: Float, common: float | Float) -> Float:
-    """Covariance (N, 2, 2) of gradients `g` (N, 2) that an error of w with that standard deviation, or those (N,), causes."""
-    w, _ = predict(g)
-    variance = np.broadcast_to(np.square(common), len(g))
-    return gradient(w, variance[:, None, None] * np.eye(2))[1]
-
-
 def normals(g: Float) -> Float:
     """Unit normals (…, 3) ∝ (−p, −q, 1) of gradients (…, 2)."""
     n = np.concatenate((-g, np.ones_like(g[..., :1])), -1)

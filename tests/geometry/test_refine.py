@@ -1,10 +1,8 @@
-import dataclasses
 
 import numpy as np
 import pytest
 
-from sftex_stages.geometry import blocks, confidence, gaussian, pooling, refine, spline, support, tensors
-from sftex_stages.geometry.camera import ORTHOGRAPHIC
+from sftex_stages.geometry import blocks, confidence, gaussian, refine, spline, support, tensors
 
 
 def exact(seed=0):
@@ -66,8 +64,7 @@ def sure_errors(xy):
     weight = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
     factor = gaussian.posterior(f, weight, gaussian.prior(f, gaussian.Smoothness(1.0, 30.0)))
     inverse = blocks.selected_inverse(factor)
-    unmoved = np.zeros((f.grid.size, 1))
-    return f, confidence.Errors(xy, np.zeros_like(xy), np.full(len(xy), 0.7), 0.004, unmoved, f.grid, inverse)
+    return f, confidence.Errors(xy, np.full(len(xy), 0.7), np.zeros((f.grid.size, 1)), f.grid, inverse)
 
 
 def test_support_follows_the_surface_and_leaves_holes():
@@ -125,67 +122,6 @@ def test_a_place_a_little_out_of_reach_is_closed(radius, closed):
     maps = support.dense(f.grid, np.zeros(f.grid.size), (300, 300), errors.xy, 20.0, errors, support.reach(xy, 20.0))
     assert not maps["supported"][150, 150]
     assert support.close_holes(maps["supported"], maps["closable"])[150, 150] == closed
-
-
-
-def refined(rng, count=3000, textons=8, shear=0.0, noise=0.02):
-    """A plane seen by textons that each err by their own constant in w: field, solution, nodes, residuals, slopes, textons."""
-    xy = rng.uniform(0, 400, (count, 2))
-    texton = np.arange(count) % textons
-    truth = np.tile([0.8, 0.3], (count, 1))
-    own = shear * rng.normal(size=(textons, 2))
-    w = tensors.predict(truth)[0] + own[texton] + noise * rng.normal(size=xy.shape)
-    stated = np.tile(max(noise, 1e-3) ** 2 * np.eye(2), (count, 1, 1))
-    nodes = pooling.pool(xy, w, stated, np.ones(count), 25.0, 0.003)
-    f = gaussian.make_field(spline.cover(np.full(2, -40.0), np.full(2, 440.0), 25.0), nodes.xy)
-    start = np.tile([0.8, 0.3], (len(nodes.xy), 1))
-    s = refine.refine(f, nodes.w, nodes.covariance, nodes.weight, start, gaussian.Smoothness(1.0, 60.0), 2)
-    g = np.einsum("npk,nk->np", ORTHOGRAPHIC.stencil(f.grid, xy)[1], s.a[spline.stencil(f.grid, xy)[0]])
-    return f, s, nodes, w, stated, xy, g, texton
-
-
-def test_shares_of_a_node_add_up_to_one():
-    nodes = refined(np.random.default_rng(1), 300)[2]
-    total = np.zeros((len(nodes.xy), 2, 2))
-    np.add.at(total, nodes.member[nodes.member >= 0], nodes.share[nodes.member >= 0])
-    assert np.allclose(total, np.eye(2), atol=1e-9)
-
-
-def test_what_a_texton_has_wrong_widens_the_spread_as_much_as_it_errs():
-    actual, predicted = [], []
-    at = np.array([[200.0, 200.0], [100.0, 300.0]])
-    for seed in range(12):
-        f, s, nodes, w, stated, _, g, texton = refined(np.random.default_rng(seed), 1000, shear=0.03, noise=0.002)
-        residual, _ = confidence.residuals(w, stated, g)
-        moved = confidence.influence(s, nodes, residual, texton)
-        index, stencil = ORTHOGRAPHIC.stencil(f.grid, at)
-        slope = np.einsum("npk,nk->np", stencil, s.a[index])
-        actual.append(((slope - [0.8, 0.3]) ** 2).sum(1).mean())
-        predicted.append((np.einsum("npk,nkt->npt", stencil, moved[index]) ** 2).sum((1, 2)).mean())
-    assert 0.5 < np.sqrt(np.mean(predicted) / np.mean(actual)) < 1.6
-
-
-def test_noise_and_misfit_nearby_widen_the_spread():
-    f, s, _, _, stated, xy, _, _ = refined(np.random.default_rng(5))
-    rng = np.random.default_rng(6)
-    g = np.tile([0.8, 0.3], (len(xy), 1))
-    size = np.where(xy[:, 0] < 200, 0.02, 0.06)
-    w = tensors.predict(g)[0] + size[:, None] * rng.normal(size=xy.shape)
-    residual, chi2 = confidence.residuals(w, stated, g)
-    inverse = blocks.selected_inverse(s.factor)
-    e = confidence.Errors(xy, residual, chi2, 0.0, np.zeros((f.grid.size, 1)), f.grid, inverse)
-    at = np.array([[100.0, 100], [300.0, 100], [100.0, 380]])
-    quiet, noisy, _ = (np.trace(c) for c in confidence.spread(e, at, g[:3]))
-    # three times the noise, in a place and its surroundings
-    assert 4 < noisy / quiet < 13
-    off = dataclasses.replace(e, residual=residual + 0.05)  # in common everywhere, which the noise does not show
-    assert abs(off.misfit / 0.05 - 1) < 0.1 and e.misfit < 0.02
-    both = [confidence.spread(x, at, g[:3]) for x in (e, off)]
-    shared = [tensors.common_error(g[:3], confidence.MISFIT * x.misfit) for x in (e, off)]
-    assert np.allclose(both[1] - both[0], shared[1] - shared[0], rtol=1e-6)
-    beside = dataclasses.replace(e, common=0.1)
-    assert np.allclose(confidence.spread(beside, at, g[:3]) - confidence.spread(e, at, g[:3]),
-                       tensors.common_error(g[:3], 0.1), rtol=1e-6)  # fmt: skip
 
 
 def test_surrounded_is_inside_of_the_hull_of_the_neighbours():
