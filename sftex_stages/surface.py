@@ -116,13 +116,12 @@ class Instances:
 
 @dataclass(frozen=True)
 class Fit:
-    """A refined surface; the instances, nodes and measured heights it was refined from, as `camera` sees them; and nats by
-    which the prior of curvature beat that of heights."""
+    """A refined surface; the instances and nodes it was refined from, as `camera` sees them; and nats by which the prior of
+    curvature beat that of heights."""
 
     instances: Instances
     nodes: pooling.Nodes
     solution: refine.Solution
-    height: gaussian.Heights | None
     camera: Camera
     gain: float
 
@@ -303,16 +302,16 @@ def refit(
     height = heights(instances, nodes, camera, spacing)
     field, data = gaussian.make_field(grid, nodes.xy, stretch), (nodes.w, nodes.covariance, nodes.weight)
     flat = refine.refine(field, *data, start, before.smooth, ROUNDS, height, before.noise)
-    field, settings = curvature.follow(field, flat.a, camera), (height, flat.noise, flat.height_noise)
+    field, settings = curvature.follow(field, flat.a, camera), (flat.height, flat.noise, flat.height_noise)
     curved = refine.refine(field, *data, flat.gradient, flat.smooth, CURVED_ROUNDS, *settings, camera=camera)
     solution = max((flat, curved), key=lambda x: x.evidence)
-    return recalibrated(Fit(instances, nodes, solution, height, camera, curved.evidence - flat.evidence), params)
+    return recalibrated(Fit(instances, nodes, solution, camera, curved.evidence - flat.evidence), params)
 
 
 def recalibrated(fit: Fit, params: Params) -> Fit:
     """Textons corrected by the surface, and the surface refined from them: one round of the alternation. Then the prior learns
     where the surface is rough."""
-    instances, nodes, solution, height, camera = fit.instances, fit.nodes, fit.solution, fit.height, fit.camera
+    instances, nodes, solution, camera = fit.instances, fit.nodes, fit.solution, fit.camera
     grid, curved = solution.field.grid, solution.field.cells is not None
     seen, _ = tensors.predict(camera.slopes_of(grid, solution.a, instances.xy))
     transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
@@ -325,10 +324,11 @@ def recalibrated(fit: Fit, params: Params) -> Fit:
         field = gaussian.make_field(grid, nodes.xy, camera.stretch(nodes.xy))
         start = gaussian.gradients(field, solution.a)
         field = curvature.follow(field, solution.a, camera) if curved else field
-        data, settings = (nodes.w, nodes.covariance, nodes.weight), (height, solution.noise, solution.height_noise)
+        data = nodes.w, nodes.covariance, nodes.weight
+        settings = solution.height, solution.noise, solution.height_noise
         solution = refine.refine(field, *data, start, solution.smooth, 1, *settings)
     data = nodes.w, nodes.covariance, nodes.weight
-    solution = refine.refine_locally(*data, solution, height, camera if curved else None)
+    solution = refine.refine_locally(*data, solution, camera if curved else None)
     return replace(fit, instances=instances, nodes=nodes, solution=solution)
 
 
@@ -342,7 +342,7 @@ def doubted(rows: Arrays, fit: Fit, choice: perspective.Choice, spacing: float, 
     field = replace(field, energies=known.field.energies)
     start = gaussian.gradients(field, known.a)
     data, settings = (nodes.w, nodes.covariance, nodes.weight), (height, known.noise, known.height_noise)
-    found = refine.refine(field, *data, start, known.smooth, 2, *settings, tune=False)
+    found = refine.refine(field, *data, start, known.smooth, 3, *settings, tune=False)
     return confidence.Other(camera, found.a)
 
 
@@ -599,4 +599,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=19, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=20, params=Params, run=run, inputs=("image", "frontal", "enrich"))

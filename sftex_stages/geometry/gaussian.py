@@ -18,6 +18,7 @@ from sftex_stages.geometry import blocks, spline
 Float = NDArray[np.floating]
 Int = NDArray[np.integer]
 
+FREEDOM = 4.0  # of the Student distribution of measured heights
 HEIGHT_SCALE = 1.0  # standard deviation of the free constant of h, in extents
 PIVOT = 1e-10  # of a diagonal element, where rounding does not reach: measured on stiff priors of up to 80 by 80 cells
 SLOPE_SCALE = 3.0  # standard deviation of an overall lean; both make evidences of different priors comparable
@@ -180,17 +181,29 @@ def without_own(g: Float, covariance: Float, weight: Float, pull: Float) -> tupl
 
 @dataclass(frozen=True)
 class Heights:
-    """Measured heights `value` (N,) px of precision `precision` (N,), off by `columns` (N, K) times unknown coefficients
-    with standard deviations `spread` (K,)."""
+    """Measured heights `value` (N,) px of precision `stated` (N,), off by `columns` (N, K) times unknown coefficients
+    with standard deviations `spread` (K,), both up to one factor; `weight` (N,), what is left of their say."""
 
     value: Float
-    precision: Float
+    stated: Float
     columns: Float
     spread: Float
+    weight: Float
+
+    @cached_property
+    def precision(self) -> Float:
+        return self.stated * self.weight
 
     def over(self, factor: float) -> "Heights":
-        """The same with that factor on the variance."""
-        return replace(self, precision=self.precision / factor)
+        """The same with that factor on the variances: what they are off by together goes with what each is off by."""
+        return replace(self, stated=self.stated / factor, spread=self.spread * np.sqrt(factor))
+
+    def reweighted(self, h: Float, factor: float) -> "Heights":
+        """The same with the weights of a Student distribution about heights `h` (N,), with `factor` on the variances."""
+        heavy = self.precision[:, None] * self.columns
+        normal, off = self.columns.T @ heavy + np.diag(1 / self.spread**2), self.value - h
+        chi2 = self.stated / factor * (off - self.columns @ np.linalg.solve(normal, heavy.T @ off)) ** 2
+        return replace(self, weight=(FREEDOM + 1) / (FREEDOM + chi2))
 
     @cached_property
     def normal(self) -> tuple[Float, Float]:

@@ -16,7 +16,9 @@ Float = NDArray[np.floating]
 
 TRIALS = (0.3, 0.12, 0.7)  # image sizes over focal length that are tried first
 BENDS = (0.03, 1.5)  # and the range believed
-OFF = (1.0, 0.01, 0.01)  # standard deviations of log size's constant, and of what sin² of the slant and its square add
+# Standard deviations of log size's constant, and of what sin² of the slant and its square add, where sizes scatter as stated:
+# they go with the sizes' noise, as a slant's effect has the same causes.
+OFF = (1.0, 0.01, 0.01)
 CHANCE = 10.0  # nats that orthographic scenes reach by themselves: sizes that say no more say nothing
 FREEDOM = 4.0  # of the Student distribution of sizes in that
 ROUNDS = 4  # of refinement for each camera tried
@@ -63,12 +65,18 @@ class Sizes:
         precision = self.trust / self.variance * bend**2
         value = (self.value + change - np.average(self.value, weights=self.trust)) / bend
         columns = np.stack((np.ones_like(steep), steep, steep**2), 1)
-        return gaussian.Heights(value, precision, columns, np.array(OFF) / bend)
+        return gaussian.Heights(value, precision, columns, np.array(OFF) / bend, np.ones(len(xy)))
 
     def unrelated(self, xy: Float, w: Float, change: Float) -> tuple[float, float]:
         """Log likelihood in nats of one size for all elements, at the best noise factor, and that factor."""
-        height = self.heights(ORTHOGRAPHIC, xy, w, change)
-        return max((height.over(k).unrelated(), k) for k in np.geomspace(*refine.HEIGHT_FACTORS, 30).tolist())
+
+        def told(factor: float) -> float:
+            height = self.heights(ORTHOGRAPHIC, xy, w, change)
+            for _ in range(ROUNDS):
+                height = height.reweighted(np.zeros(len(xy)), factor)
+            return height.over(factor).unrelated()
+
+        return max((told(k), k) for k in np.geomspace(*refine.HEIGHT_FACTORS, 30).tolist())
 
     def alike(self, value: Float, w: Float) -> tuple[float, float]:
         """Log likelihood in nats of log sizes `value` (M,) that should all be the same but for what the slant explains, `w`
@@ -79,7 +87,7 @@ class Sizes:
         ridge = np.append(1e-12 * float((x**2).sum()), 1 / np.square(OFF[1:]))
         for _ in range(6):
             heavy = x * weight[:, None]
-            r = y - x @ np.linalg.solve(heavy.T @ x + np.diag(scale * ridge), heavy.T @ y)
+            r = y - x @ np.linalg.solve(heavy.T @ x + np.diag(ridge), heavy.T @ y)
             scale = max(float(np.average(r**2, weights=weight)), 1e-12)
             weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
         trials = scale * np.geomspace(0.05, 20, 40)

@@ -18,7 +18,7 @@ Float = NDArray[np.floating]
 
 FREEDOM = 4.0  # of the Student distribution; two dimensions
 NOISE_FACTORS = (0.2, 50.0)
-HEIGHT_FACTORS = (0.02, 100.0)
+HEIGHT_FACTORS = (0.002, 100.0)
 LOCAL_ROUNDS = (1, 1, 2)  # of each pass that learns where the surface is rough; only those beyond the first weigh by residuals
 
 
@@ -37,6 +37,7 @@ class Solution:
     noise: float
     evidence: float
     height_noise: float = 1.0
+    height: gaussian.Heights | None = None  # with robust weights
 
 
 def linearise(w: Float, omega: Float, g: Float) -> tuple[Float, Float, float]:
@@ -96,7 +97,7 @@ def refine(
         of: smoothness and noise by one pattern search step, two Gauss-Newton steps, new robust weights. The first has no
         weights to go by.
     height
-        heights, their precisions up to one noise factor, if they are measured (element size under perspective).
+        heights, their precisions up to one noise factor, if they are measured (element size under perspective); robust.
     noise, height_noise
         factors on `covariance`, and on the heights' variance, to start from; `tune=False` keeps them and the smoothness.
     camera
@@ -135,10 +136,13 @@ def refine(
         spread = gaussian.gradient_covariance(f, factor)
         mean, alone = gaussian.without_own(g, spread, information, pull)
         robust = trust * student(w, precision / noise, tensors.limit(mean), alone)[0]
+        if height is not None:
+            height = height.reweighted(gaussian.heights(f, a), float(np.exp(x[3])))
         if camera is not None and k < rounds - 1:
             f = curvature.follow(f, a, camera)
             x[0] = np.log(gaussian.softened(f, smooth).strength)
-    return Solution(f, a, factor, g, spread, robust, smooth, noise, score(x), float(np.exp(x[3])) if len(x) > 3 else 1.0)
+    height_noise = 1.0 if height is None else float(np.exp(x[3]))
+    return Solution(f, a, factor, g, spread, robust, smooth, noise, score(x), height_noise, height)
 
 
 def refine_locally(
@@ -146,7 +150,6 @@ def refine_locally(
     covariance: Float,
     trust: Float,
     found: Solution,
-    height: gaussian.Heights | None = None,
     camera: Camera | None = None,
 ) -> Solution:
     """The surface `found` refined under a prior that is rougher where it is rough (`roughness.py`), and with a `camera` about
@@ -160,7 +163,7 @@ def refine_locally(
             f = curvature.follow(f, found.a, camera)
         shaped = roughness.learn(f, found.a, found.factor, found.smooth).field
         start, smooth, noise = found.gradient, found.smooth, found.noise
-        found = refine(shaped, w, covariance, trust, start, smooth, rounds, height, noise, found.height_noise, tune=False)
+        found = refine(shaped, w, covariance, trust, start, smooth, rounds, found.height, noise, found.height_noise, tune=False)
     return found
 
 

@@ -219,7 +219,9 @@ def test_measured_heights_are_in_the_energy_as_in_the_marginal_likelihood():
     rng = np.random.default_rng(1)
     f = gaussian.make_field(spline.cover(np.zeros(2), np.full(2, 100.0), 20.0), xy)
     weight, smooth = np.linalg.inv(covariance), gaussian.Smoothness(1.0, 30.0)
-    height = gaussian.Heights(5 * rng.normal(size=15), rng.uniform(0.1, 1.0, 15), np.zeros((15, 1)), np.ones(1))
+    height = gaussian.Heights(
+        5 * rng.normal(size=15), rng.uniform(0.1, 1.0, 15), np.zeros((15, 1)), np.ones(1), np.ones(15)
+    )
     c = signs.coupling(f, d, weight, smooth, height)
     s = rng.choice([-1.0, 1.0], (15, 4))
     energy = signs.energies(c, s, np.tile(c.lift[:, None], (1, 4)))
