@@ -22,8 +22,9 @@ OFF = (1.0, 0.01, 0.01)
 CHANCE = 10.0  # nats that orthographic scenes reach by themselves: sizes that say no more say nothing
 FREEDOM = 4.0  # of the Student distribution of sizes in that
 ROUNDS = 4  # of refinement for each camera tried
-GAIN = 50.0  # nats over orthography that perspective must bring: neighbouring elements share errors of their size
-DOUBT, MOST_DOUBT = 2.0, 0.5  # times what the curvature of these says of log 1/f, for the same reason; and the most of it
+GAIN = 25.0  # nats over orthography that perspective must bring: 50 orthographic images reach 8
+# Times what the curvature of these says of log 1/f, since neighbouring elements share errors of their size; and the most of it
+DOUBT, MOST_DOUBT = 2.0, 0.5
 
 
 def flatten_tensors(camera: Camera, xy: Float, w: Float, covariance: Float) -> tuple[Float, Float, Float]:
