@@ -501,7 +501,9 @@ def outputs(
     shear = found.common * calibration.shear_effect(transform)[1]
     moved = confidence.influence(solution, fit.nodes, residual, instances.texton, shear, instances.xy)
     inverse = blocks.selected_inverse(solution.factor)
-    errors = confidence.Errors(instances.xy[k], chi2[k], moved, grid, inverse, camera, other)
+    errors = confidence.Errors(
+        instances.xy[k], chi2[k], moved, grid, inverse, solution.smooth.reach / spacing, camera, other
+    )
     spread = confidence.spread(errors, instances.xy)
     sigma = confidence.angle(errors, instances.xy, g, spread)
     normal = resolve(instances, g)
@@ -599,4 +601,4 @@ def resolve(instances: Instances, g: Float) -> Float:
     return tensors.normals(d * np.where((d * g).sum(1) < 0, -1.0, 1.0)[:, None])
 
 
-STAGE = Stage(name="surface", version=21, params=Params, run=run, inputs=("image", "frontal", "enrich"))
+STAGE = Stage(name="surface", version=22, params=Params, run=run, inputs=("image", "frontal", "enrich"))

@@ -90,6 +90,8 @@ def test_noise_nearby_widens_the_spread_and_so_does_what_is_shared():
     quiet, noisy, _ = (np.trace(c) for c in confidence.spread(e, at))
     # three times the noise, in a place and its surroundings
     assert 4 < noisy / quiet < 13
+    folded = dataclasses.replace(e, reach=confidence.REACH / 4)
+    assert np.allclose(confidence.spread(folded, at), 2 * confidence.spread(e, at))
     shared = dataclasses.replace(e, influence=s.a[:, None])  # an error of the plane's own slope
     added = confidence.spread(shared, at) - confidence.spread(e, at)
     assert np.allclose(added, np.outer(PLANE, PLANE), rtol=0.1)
