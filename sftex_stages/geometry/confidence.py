@@ -7,8 +7,8 @@ modelled at all. The instances themselves show it, by their residuals against th
 - texton by texton, in what each moves the surface (the cluster-robust covariance of Liang & Zeger 1986);
 - nearby, in their scatter (the noise there) and in their mean (what the surface does not follow).
 
-And the posterior is as right as its prior: all but exact on a round body, whose smoothness reaches over all of the image, less so
-on folds, where it reaches over a few nodes.
+And the posterior is as right as its prior: all but exact on a round body, whose smoothness reaches over all of the image, less
+so on folds, where it reaches over a few nodes.
 
 What all textons have wrong together shows in no residual; `calibration.py` estimates it. It is taken through the fit as well:
 where the surface faces the camera a tensor hardly says how it leans, and its error there is that of the places around.
