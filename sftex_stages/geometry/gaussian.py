@@ -18,7 +18,7 @@ from sftex_stages.geometry import blocks, spline
 Float = NDArray[np.floating]
 Int = NDArray[np.integer]
 
-FREEDOM = 4.0  # of the Student distribution of measured heights
+FREEDOM = 4.0  # of the Student distribution of measured heights, and of the sizes that tell them
 HEIGHT_SCALE = 1.0  # standard deviation of the free constant of h, in extents
 PIVOT = 1e-10  # of a diagonal element, where rounding does not reach: measured on stiff priors of up to 80 by 80 cells
 SLOPE_SCALE = 3.0  # standard deviation of an overall lean; both make evidences of different priors comparable

@@ -20,7 +20,6 @@ BENDS = (0.03, 1.5)  # and the range believed
 # they go with the sizes' noise, as a slant's effect has the same causes.
 OFF = (1.0, 0.01, 0.01)
 CHANCE = 10.0  # nats that orthographic scenes reach by themselves: sizes that say no more say nothing
-FREEDOM = 4.0  # of the Student distribution of sizes in that
 ROUNDS = 4  # of refinement for each camera tried
 GAIN = 25.0  # nats over orthography that perspective must bring: 50 orthographic images reach 8
 # Times what the curvature of these says of log 1/f, since neighbouring elements share errors of their size; and the most of it
@@ -90,9 +89,9 @@ class Sizes:
             heavy = x * weight[:, None]
             r = y - x @ np.linalg.solve(heavy.T @ x + np.diag(ridge), heavy.T @ y)
             scale = max(float(np.average(r**2, weights=weight)), 1e-12)
-            weight = (FREEDOM + 1) / (FREEDOM + r**2 / scale)
+            weight = (gaussian.FREEDOM + 1) / (gaussian.FREEDOM + r**2 / scale)
         trials = scale * np.geomspace(0.05, 20, 40)
-        student = 0.5 * (FREEDOM + 1) * np.log1p(r[:, None] ** 2 / trials / FREEDOM) + 0.5 * np.log(trials)
+        student = 0.5 * (gaussian.FREEDOM + 1) * np.log1p(r[:, None] ** 2 / trials / gaussian.FREEDOM) + 0.5 * np.log(trials)
         cost = student.sum(0)
         return -float(cost.min()), float(trials[cost.argmin()])
 
