@@ -37,7 +37,9 @@ NOISE_FACTORS = (0.005, 20.0)
 # what they may have in common everywhere. Round numbers, the same for all images; chosen among some hundred settings on the
 # benchmark's images and sixty-eight scenes drawn at random.
 TEXTONS, MISFIT = 1.5, 0.5
-REACH = 6.0  # of smoothness, in spacings of nodes, at which the posterior is taken as it is; its variance falls with the root
+# Reach of smoothness, in spacings of nodes, at which the posterior is taken as it is; its variance falls with the root of the
+# reach, and no more is made of one under the second.
+REACH, SHORT = 6.0, 4.0
 CHUNK = 4096  # places at a time: bounded memory
 
 
@@ -150,5 +152,5 @@ def _spread(e: Errors, at: Float) -> Float:
     rows = np.arange(0, 2 * index.size + 1, 16)
     design = sp.csr_matrix((stencil.ravel(), np.repeat(index, 2, 0).ravel(), rows), shape=(2 * len(at), e.grid.size))
     moved = np.asarray(design @ e.influence).reshape(len(at), 2, -1)
-    own = e.noise(at) * np.sqrt(REACH / e.reach)
+    own = e.noise(at) * np.sqrt(REACH / max(e.reach, SHORT))
     return np.asarray(moved @ np.swapaxes(moved, 1, 2) + own[:, None, None] * posterior)

@@ -90,8 +90,10 @@ def test_noise_nearby_widens_the_spread_and_so_does_what_is_shared():
     quiet, noisy, _ = (np.trace(c) for c in confidence.spread(e, at))
     # three times the noise, in a place and its surroundings
     assert 4 < noisy / quiet < 13
-    folded = dataclasses.replace(e, reach=confidence.REACH / 4)
-    assert np.allclose(confidence.spread(folded, at), 2 * confidence.spread(e, at))
+    plain = confidence.spread(e, at)
+    assert np.allclose(confidence.spread(dataclasses.replace(e, reach=4 * confidence.REACH), at), plain / 2)
+    folded = [confidence.spread(dataclasses.replace(e, reach=x), at) for x in (confidence.SHORT, 1.0)]
+    assert np.array_equal(*folded) and (np.trace(folded[0], axis1=1, axis2=2) > np.trace(plain, axis1=1, axis2=2)).all()
     shared = dataclasses.replace(e, influence=s.a[:, None])  # an error of the plane's own slope
     added = confidence.spread(shared, at) - confidence.spread(e, at)
     assert np.allclose(added, np.outer(PLANE, PLANE), rtol=0.1)
