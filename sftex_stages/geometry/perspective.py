@@ -69,9 +69,10 @@ class Sizes:
 
     def unrelated(self, xy: Float, w: Float, change: Float) -> tuple[float, float]:
         """Log likelihood in nats of one size for all elements, at the best noise factor, and that factor."""
+        stated = self.heights(ORTHOGRAPHIC, xy, w, change)
 
         def told(factor: float) -> float:
-            height = self.heights(ORTHOGRAPHIC, xy, w, change)
+            height = stated
             for _ in range(ROUNDS):
                 height = height.reweighted(np.zeros(len(xy)), factor)
             return height.over(factor).unrelated()
