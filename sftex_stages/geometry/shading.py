@@ -3,8 +3,13 @@
     E_i = a + b n_z,i + s_i (c_x, c_y)·n_xy,i + u(x_i) + noise
 
 with E_i the relative irradiance on the textons' common scale, (a, b, c) the light, and u a slowly varying remainder (a near
-light, interreflection, soft shadows) with a prior; noise is Student distributed (cast shadows, highlights). Given the signs
-all this is linear; given the light, the data are a linear field on the signs.
+light, interreflection, soft shadows) with a prior; noise is Student distributed (highlights). Given the signs all this is
+linear; given the light, the data are a linear field on the signs.
+
+Where something else stands in the light, E is what is left of it whatever the normal: log e_0 + noise. `Light.lit` is the
+posterior that it is not so. Darkness that a shadow explains says nothing of signs, and a pattern that turns a shadowed part
+away from the light explains it no better. A pattern with its signs wrong leaves dark nodes unexplained as well, so shadows are
+believed only where they are alike, pay for themselves, and are left out of the search until it knows most signs.
 """
 
 from dataclasses import dataclass
@@ -12,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from sftex_stages.geometry import spline
 
@@ -21,6 +27,11 @@ FREEDOM = 4.0
 REMAINDER_CELLS = 3  # along the longer side: u must not follow folds
 REMAINDER_SPREAD = 0.25  # standard deviation of u, of the mean irradiance
 QUIET = 0.03  # least noise believed, of the mean irradiance: model error of "one light"
+STUDENT = float(gammaln((FREEDOM + 1) / 2) - gammaln(FREEDOM / 2) - 0.5 * np.log(np.pi * FREEDOM))
+# Shadow: standard deviation of log e there; nodes that start it, darker than the light gives by as many noise scales, and how
+# many there must be; pseudo-counts of nodes in shadow and in the light; nats that it must gain.
+SHADE, DARK, FEWEST, COUNTS, COST = 0.12, 4.0, 5, (1.0, 20.0), 20.0
+SETTLED = 12  # rounds after which a light hardly changes
 
 
 @dataclass(frozen=True)
@@ -35,17 +46,19 @@ class Shading:
     @cached_property
     def null(self) -> "Light":
         """The best light that tells nothing of signs."""
-        return fit(self, np.zeros(len(self.e)), rounds=6, directed=False)
+        return settled(self, np.zeros(len(self.e)), directed=False)
 
 
 @dataclass(frozen=True)
 class Light:
-    """`direction` (a, b, c_x, c_y), `remainder` (U,), noise scale, Student weights (M,), log likelihood in nats."""
+    """`direction` (a, b, c_x, c_y), `remainder` (U,), noise scale, Student weights (M,) times the posterior `lit` (M,) of not
+    lying in shadow, log likelihood in nats."""
 
     direction: Float
     remainder: Float
     noise: float
     weight: Float
+    lit: Float
     log_likelihood: float
 
 
@@ -56,15 +69,23 @@ def make_shading(xy: Float, e: Float, variance: Float, normal: Float) -> Shading
     return Shading(e, variance, normal, np.asarray(spline.design(grid, xy).todense()))
 
 
-def fit(data: Shading, m: Float, start: Light | None = None, rounds: int = 3, directed: bool = True) -> Light:
+def settled(data: Shading, s: Float, directed: bool = True) -> Light:
+    """The light for signs `s` (M,), with shadows where they are believed; `directed=False` leaves (c_x, c_y) at zero."""
+    plain, cast = (fit(data, s, rounds=SETTLED, directed=directed, shadows=shadows) for shadows in (False, True))
+    return cast if cast.log_likelihood > plain.log_likelihood + COST else plain
+
+
+def fit(
+    data: Shading, m: Float, start: Light | None = None, rounds: int = 3, directed: bool = True, shadows: bool = False
+) -> Light:
     """The light for mean signs `m` (M,); `directed=False` leaves (c_x, c_y) at zero, the null hypothesis."""
     n = data.normal
-    ones = np.ones(len(n))
+    ones: Float = np.ones(len(n))
     columns = [ones, n[:, 2], m * n[:, 0], m * n[:, 1]] if directed else [ones, n[:, 2]]
     x = np.concatenate((np.stack(columns, 1), data.basis), 1)
     k = len(columns)
     weight = ones if start is None else start.weight
-    noise = 0.1 if start is None else start.noise
+    noise, lit = 0.1 if start is None else start.noise, ones
     ridge = np.concatenate((np.full(k, 1e-4), np.full(data.basis.shape[1], 1 / REMAINDER_SPREAD**2)))
     beta = np.zeros(x.shape[1])
     for _ in range(rounds):
@@ -78,14 +99,40 @@ def fit(data: Shading, m: Float, start: Light | None = None, rounds: int = 3, di
         unsure = (1 - m**2) * (n[:, :2] @ beta[2:4]) ** 2 if directed else 0.0
         r2 = r**2 + unsure
         own = noise**2 + data.variance
-        weight = (FREEDOM + 1) / (FREEDOM + r2 / own)
-        noise = max(float(np.sqrt(np.average(np.maximum(r2 * weight - data.variance, 0)))), QUIET)
+        if shadows:
+            lit = cast(data.e, r, r2, own, lit)[1]
+        weight = lit * (FREEDOM + 1) / (FREEDOM + r2 / own)
+        noise = max(float(np.sqrt(np.average(np.maximum(r2 * weight - lit * data.variance, 0)) / lit.mean())), QUIET)
     own = noise**2 + data.variance
-    student = -0.5 * (FREEDOM + 1) * np.log1p(r2 / own / FREEDOM) - 0.5 * np.log(own)
+    log, lit = cast(data.e, r, r2, own, lit) if shadows else (student(r2, own), ones)
     direction = np.zeros(4)
     direction[:k] = beta[:k]
     penalty = 0.5 * float((beta[k:] ** 2).sum()) / REMAINDER_SPREAD**2
-    return Light(direction, beta[k:], noise, weight, float(student.sum()) - penalty)
+    return Light(direction, beta[k:], noise, weight, lit, float(log.sum()) - penalty)
+
+
+def student(r2: Float, variance: Float) -> Float:
+    """Log density (M,) of residuals, squared, of that variance."""
+    return np.asarray(STUDENT - 0.5 * (FREEDOM + 1) * np.log1p(r2 / variance / FREEDOM) - 0.5 * np.log(variance))
+
+
+def cast(e: Float, r: Float, r2: Float, variance: Float, lit: Float) -> tuple[Float, Float]:
+    """Log density (M,) of irradiance `e` (M,), in the light, where it is off by `r` (M,), squared `r2`, of that variance, or in
+    shadow; and the posterior (M,) of the light, from the one `lit` (M,) before."""
+    log = student(r2, variance)
+    dark = 1 - lit
+    if dark.sum() < FEWEST:
+        dark = ((r < 0) & (r2 > DARK**2 * variance) & (e > 0)).astype(float)
+    count = float(dark.sum())
+    if count < FEWEST:
+        return log, np.ones_like(lit)
+    tone = np.log(np.maximum(e, 1e-3))
+    off = (tone - float(dark @ tone) / count) / SHADE
+    share = (count + COUNTS[0]) / (len(e) + sum(COUNTS))
+    shade = np.log(share) - 0.5 * off**2 - tone - np.log(SHADE * np.sqrt(2 * np.pi))
+    log = np.log1p(-share) + log
+    total = np.logaddexp(log, shade)
+    return total, np.exp(log - total)
 
 
 def pull(data: Shading, light: Light) -> Float:

@@ -154,22 +154,24 @@ def bias_of(
 ) -> Float:
     """Fields (N, S) of measured heights and, for those of the patterns `m` (N, S) in `lit` (S,), of shading; refits `lights` in
     place."""
-    return c.lift[:, None] + lit_bias(data, m, lit, lights)
-
-
-def lit_bias(data: Data, m: Float, lit: NDArray[np.bool_], lights: list[shading.Light | None]) -> Float:
-    """Those of shading alone."""
     bias = np.zeros_like(m)
     if data.shading is not None:
         for k in np.flatnonzero(lit):
             lights[k] = light = shading.fit(data.shading, m[:, k], lights[k], 1 if lights[k] else 4)
             bias[:, k] = data.trust * shading.pull(data.shading, light)
-    return bias
+    return c.lift[:, None] + bias
 
 
 def own_bias(data: Data, c: signs.Coupling, s: Float) -> Float:
-    """Fields (N,) of heights and shading on the pattern `s` (N,), under its own light."""
-    return bias_of(data, c, s[:, None], np.ones(1, bool), [None])[:, 0]
+    """Fields (N,) of heights and shading on the pattern `s` (N,), under its own light and shadows."""
+    return c.lift + shaded(data, s)
+
+
+def shaded(data: Data, s: Float) -> Float:
+    """That of shading."""
+    if data.shading is None:
+        return np.zeros(len(s))
+    return data.trust * shading.pull(data.shading, shading.settled(data.shading, s))
 
 
 def rung(
@@ -203,7 +205,7 @@ def shade_of(data: Data, s: Float) -> tuple[float, shading.Light | None]:
     """Log likelihood that the shading gives signs `s` (N,), relative to a light that tells nothing."""
     if data.shading is None:
         return 0.0, None
-    light = shading.fit(data.shading, s, rounds=4)
+    light = shading.settled(data.shading, s)
     return max(light.log_likelihood - data.shading.null.log_likelihood - 2.0, 0.0), light
 
 
@@ -416,8 +418,7 @@ def ties(data: Data, c: signs.Coupling, s: Float, piece: Int) -> tuple[Float, Fl
     """Nats (P, P) by which smoothness ties the pieces (N,) of a pattern `s` (N,) together, and (P,) shading to its light."""
     member = np.zeros((len(s), int(piece.max()) + 1))
     member[np.arange(len(s)), piece] = s
-    bias = lit_bias(data, s[:, None], np.ones(1, bool), [None])[:, 0]
-    return member.T @ signs.product(c, member), member.T @ bias
+    return member.T @ signs.product(c, member), member.T @ shaded(data, s)
 
 
 def settle(found: Candidate, rounds: int = 12) -> Float:

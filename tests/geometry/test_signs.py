@@ -87,33 +87,6 @@ def test_search_recovers_signs_from_all_cues_and_ranks_by_evidence():
     assert np.allclose(direction / np.linalg.norm(direction), np.array([3, -2]) / np.sqrt(13), atol=0.1)
 
 
-def test_light_is_recovered_and_pulls_toward_the_true_signs():
-    rng = np.random.default_rng(5)
-    xy = rng.uniform(0, 100, (400, 2))
-    g = rng.normal(size=(400, 2)) * 0.5
-    n = tensors.normals(g)
-    e = 0.4 + 0.6 * n[:, 2] + 0.5 * n[:, 0] + 0.01 * rng.normal(size=400)
-    e[::20] *= 0.3  # cast shadows
-    data = shading.make_shading(xy, e, np.full(400, 1e-4), n)
-    light = shading.fit(data, np.ones(400), rounds=10)
-    assert np.allclose(light.direction[2:], [0.5, 0.0], atol=0.03)
-    far = (np.abs(n[:, 0]) > 0.1) & (np.arange(400) % 20 > 0)
-    assert (shading.pull(data, light)[far] > 0).mean() > 0.97
-    null = shading.fit(data, np.zeros(400), directed=False, rounds=10)
-    assert light.log_likelihood > null.log_likelihood + 100
-
-
-def test_constant_irradiance_says_nothing():
-    rng = np.random.default_rng(6)
-    xy = rng.uniform(0, 100, (300, 2))
-    n = tensors.normals(rng.normal(size=(300, 2)) * 0.5)
-    data = shading.make_shading(xy, 1 + 0.01 * rng.normal(size=300), np.full(300, 1e-4), n)
-    value, _ = sign_search.shade_of(
-        sign_search.Data(xy, n[:, :2], np.ones((300, 2, 2)), np.ones(300), xy[:, 0], data), np.ones(300)
-    )
-    assert value < 3
-
-
 def test_em_raises_its_posterior_and_solves_a_cylinder():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0, 100, (120, 2))
