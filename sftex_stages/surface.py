@@ -106,6 +106,7 @@ class Instances:
 
     table: Arrays
     xy: Float
+    transform: Float  # (N, 2, 2), as the rays of the camera see it
     trust: Float  # 0 below the threshold
     texton: NDArray[np.integer]  # 0 … K − 1, used textons only
     calibration: calibration.Calibration
@@ -173,7 +174,7 @@ def prepare(rows: Arrays, params: Params, camera: Camera | None = None) -> Insta
     spread = covariance * result.noise[texton][:, None, None] + (params.model_error**2 / 2) * np.eye(2)
     log_scale = np.log(calibration.scales(transform, result.e[texton]))
     cell = np.full(len(xy), spacing_of(xy[trust > 0], params.nodes))
-    return Instances(rows, xy, trust, texton.astype(np.int64), result, spread, log_scale, cell)
+    return Instances(rows, xy, transform, trust, texton.astype(np.int64), result, spread, log_scale, cell)
 
 
 def spacing_of(xy: Float, most: int) -> float:
@@ -314,9 +315,8 @@ def recalibrated(fit: Fit, params: Params) -> Fit:
     instances, nodes, solution, camera = fit.instances, fit.nodes, fit.solution, fit.camera
     grid, curved = solution.field.grid, solution.field.cells is not None
     seen, _ = tensors.predict(camera.slopes_of(grid, solution.a, instances.xy))
-    transform = camera.flatten(instances.xy) @ instances.table["transform"].astype(float)
     found = calibration.against_surface(
-        instances.calibration, transform, instances.covariance, instances.texton, instances.trust, seen
+        instances.calibration, instances.transform, instances.covariance, instances.texton, instances.trust, seen
     )
     if not np.array_equal(found.e, instances.calibration.e):
         instances = replace(instances, calibration=found)
@@ -497,8 +497,7 @@ def outputs(
     g = camera.slopes_of(grid, solution.a, instances.xy)
     k, found = instances.trust > 0, instances.calibration
     residual, chi2 = confidence.residuals(found.w, instances.covariance, g)
-    transform = camera.flatten(instances.xy) @ table["transform"].astype(float)
-    shear = found.common * calibration.shear_effect(transform)[1]
+    shear = found.common * calibration.shear_effect(instances.transform)[1]
     moved = confidence.influence(solution, fit.nodes, residual, instances.texton, shear, instances.xy)
     inverse = blocks.selected_inverse(solution.factor)
     errors = confidence.Errors(
