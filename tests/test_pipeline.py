@@ -37,5 +37,5 @@ def test_parameters_survive_the_key(stage):
     """Numbers that differ in the last bit give different keys."""
     for key, value in stage.params().model_dump().items():
         if isinstance(value, float):
-            other = stage.params.model_construct(**{**stage.params().model_dump(), key: np.nextafter(value, 0).item()})
+            other = stage.params().model_copy(update={key: np.nextafter(value, 0).item()})
             assert len({keys.digest(keys.job_identity(stage, p, {}, {}, None)) for p in (stage.params(), other)}) == 2
