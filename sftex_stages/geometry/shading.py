@@ -28,9 +28,10 @@ REMAINDER_CELLS = 3  # along the longer side: u must not follow folds
 REMAINDER_SPREAD = 0.25  # standard deviation of u, of the mean irradiance
 QUIET = 0.03  # least noise believed, of the mean irradiance: model error of "one light"
 STUDENT = float(gammaln((FREEDOM + 1) / 2) - gammaln(FREEDOM / 2) - 0.5 * np.log(np.pi * FREEDOM))
-# Shadow: standard deviation of log e there; nodes that start it, darker than the light gives by as many noise scales, and how
-# many there must be; pseudo-counts of nodes in shadow and in the light; nats that it must gain.
-SHADE, DARK, FEWEST, COUNTS, COST = 0.12, 4.0, 5, (1.0, 20.0), 20.0
+SHADE = 0.12  # standard deviation of log e in shadow
+DARK, FEWEST = 4.0, 5  # noise scales below what the light gives at which nodes start a shadow, and how many there must be
+COUNTS = (1.0, 20.0)  # pseudo-counts of nodes in shadow, and in the light
+COST = 20.0  # nats that shadows must gain
 SETTLED = 12  # rounds after which a light hardly changes
 
 
@@ -71,14 +72,15 @@ def make_shading(xy: Float, e: Float, variance: Float, normal: Float) -> Shading
 
 def settled(data: Shading, s: Float, directed: bool = True) -> Light:
     """The light for signs `s` (M,), with shadows where they are believed; `directed=False` leaves (c_x, c_y) at zero."""
-    plain, cast = (fit(data, s, rounds=SETTLED, directed=directed, shadows=shadows) for shadows in (False, True))
-    return cast if cast.log_likelihood > plain.log_likelihood + COST else plain
+    plain, other = (fit(data, s, rounds=SETTLED, directed=directed, shadows=shadows) for shadows in (False, True))
+    return other if other.log_likelihood > plain.log_likelihood + COST else plain
 
 
 def fit(
     data: Shading, m: Float, start: Light | None = None, rounds: int = 3, directed: bool = True, shadows: bool = False
 ) -> Light:
-    """The light for mean signs `m` (M,); `directed=False` leaves (c_x, c_y) at zero, the null hypothesis."""
+    """The light for mean signs `m` (M,); `directed=False` leaves (c_x, c_y) at zero, the null hypothesis; with `shadows` some
+    nodes may lie in shadow."""
     n = data.normal
     ones: Float = np.ones(len(n))
     columns = [ones, n[:, 2], m * n[:, 0], m * n[:, 1]] if directed else [ones, n[:, 2]]

@@ -168,7 +168,7 @@ def own_bias(data: Data, c: signs.Coupling, s: Float) -> Float:
 
 
 def shaded(data: Data, s: Float) -> Float:
-    """That of shading."""
+    """The field (N,) of shading on the pattern `s` (N,), under its own light and shadows."""
     if data.shading is None:
         return np.zeros(len(s))
     return data.trust * shading.pull(data.shading, shading.settled(data.shading, s))
